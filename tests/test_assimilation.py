@@ -11,9 +11,8 @@ from torch import nn
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, usual_sizes
-from rt_torchrl.fit.prior import BeliefPrior
-from rt_torchrl.fit.record import chained, sensor_record
+from rt_torchrl.fit.least_squares import Estimation
+from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import sensors_of, state_sensors
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
@@ -22,11 +21,11 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
+from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.sensor_assimilation import FirstStates, SensorAssimilation
 
 WINDS = (1.0, -2.0)
 
@@ -70,16 +69,19 @@ def test_nothing_is_drawn_from_a_record_without_noise():
 
 
 @pytest.mark.parametrize("initial", ["measured", "estimated"])
-def test_what_is_reported_of_segments_is_the_cost_of_whole_records(initial):
-    """J_p has the start that suits the whole record best, which is here a regression on the residuals of the slope."""
+def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
+    """Segments begin with what was read before the fit, and with what suits them best after it if that is estimated."""
     record, closure = lines()[0], Slope()
-    found = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
-    found = found.update([record], [], 1, torch.Generator())
+    fit = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
+    found = fit.update([record], [], 1, torch.Generator())
     times, x = 0.1 * np.arange(101), record.states[:, 0].numpy()
-    for weights, J_p in ((Slope().w, found.start), (closure.w, found.best)):
+    for weights, J_p, free in ((Slope().w, found.start, False), (closure.w, found.best, initial == "estimated")):
         left = x - (weights[0] + WINDS[0] * weights[1]).item() * times
-        start = left.mean() if initial == "estimated" else left[0]
-        assert J_p == pytest.approx(0.1 * 0.5 * ((left - start) ** 2).sum(), rel=1e-7)
+        parts = np.stack([left[20 * k : 20 * k + 21] for k in range(5)])
+        parts = parts - (parts.mean(1) if free else parts[:, 0])[:, None]
+        assert J_p == pytest.approx(0.1 * 0.5 * (parts**2).sum(1).mean(), rel=1e-7)
+    samples = parts if initial == "estimated" else parts[:, 1:]
+    assert fit.report() == {"rms/position [m]": pytest.approx(np.sqrt((samples**2).mean()), rel=1e-6)}
 
 
 class Bent(nn.Module):
@@ -210,14 +212,42 @@ def test_the_truth_has_no_cost_in_segments():
 
 
 @pytest.mark.parametrize("method", ["gradient", "levenberg_marquardt"])
-def test_what_is_reported_is_the_cost_of_whole_records(method):
+def test_the_cost_that_is_reported_is_that_of_the_segments(method):
     plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
-    record = flight(plant)
-    before = of_segments(plant, closure).normal_equations(replayed(record)).cost.item()
+    segments = replayed(record := flight(plant)).segments(12, plant.dt)
+    before = of_segments(plant, closure).normal_equations(segments).cost.item()
     found = of_segments(plant, closure, segment=12, method=method, iterations=3)
     found = found.update([record], [], 1, torch.Generator())
     assert found.start == pytest.approx(before, rel=1e-12)  # two ways to sum
-    assert found.best == pytest.approx(of_segments(plant, closure).normal_equations(replayed(record)).cost.item())
+    assert found.best == pytest.approx(of_segments(plant, closure).normal_equations(segments).cost.item())
+
+
+class NamedSlope(nn.Module):
+    """ẋ = w, a slope with a name."""
+
+    def __init__(self):
+        super().__init__()
+        self.w = nn.Parameter(torch.tensor([0.5], dtype=torch.float64))
+
+    def forward(self, features):
+        return self.w + 0.0 * features
+
+    def named_coefficients(self):
+        return {"slope": self.w[0]}
+
+
+def test_standard_errors_are_those_of_the_regression_that_step_4_is():
+    """Over a record that begins with its first sample, a slope is the only unknown, whose error is σ/√Σt²."""
+    plant, generator = Line(), torch.Generator().manual_seed(0)
+    closure, times = NamedSlope(), 0.1 * np.arange(401)
+    noise = 0.05 * torch.randn(401, generator=generator, dtype=torch.float64).numpy()
+    noise[0] = 0.0
+    fit = assimilation(plant, closure, initial="measured")
+    record = line_segment(0.7 * times + noise, wind=0.0)
+    fit.update([record], [], 1, generator)
+    (error,) = fit.standard_errors([record]).values()
+    assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
+    assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
 
 
 def test_sensitivities_start_at_their_own_time():
@@ -337,7 +367,7 @@ def test_nothing_is_fitted_in_no_iteration_and_a_start_from_nonsense_begins_anew
 
 def test_what_does_not_go_with_sensors_is_refused():
     for options in ({"initial": "measured"}, {"segment": 5}):
-        with pytest.raises(ValueError, match=r"sensors=\('position',\) .* need initial='estimated' and segment=0"):
+        with pytest.raises(ValueError, match=r"sensors=\('position',\) .* need initial='estimated' and no segment"):
             config("position", **options)
     plant = WindTurbine(horizon=60.0)
     closure = plant.make_closure(torch.Generator())
@@ -356,69 +386,7 @@ def test_a_recipe_that_fits_sensors_leaves_the_hypotheses_out():
     assert from_command_line(recipe, []).twinning.hypotheses.which == "automatic"
 
 
-class DriftingLine(Line):
-    """The line with the methods that step 4 asks for."""
-
-    def draw_initial_state(self, batch, generator):
-        return 0.1 * torch.randn(batch, 1, generator=generator, dtype=torch.float64)
-
-
-def line_step(**options):
-    closure = Slope()
-    return SensorAssimilation(DigitalTwin(DriftingLine(), closure), config("position", **options)), closure
-
-
 TIMES = 0.1 * np.arange(61)
-
-
-def line_records(slopes, *, pushes=0.0):
-    """A record in each of two winds; something pushes the states in the middle by ``pushes``."""
-    jump = pushes * (np.arange(61) > 30)
-    return [
-        line_segment(0.05 + (slopes[0] + slopes[1] * z) * TIMES + jump + 0.02 * noise_of(61, k), wind=z)
-        for k, z in enumerate((1.0, -2.0))
-    ]
-
-
-def test_pushes_in_step_4_are_those_of_an_estimation():
-    """And they keep the weights from bending: a push of 1 in 6 s would be taken for a slope."""
-    bent, plain = line_step()
-    bent.update(line_records((0.8, 0.1), pushes=1.0), [], 1, torch.Generator())
-    step, closure = line_step(pushes=2, push=2.0)
-    step.update(line_records((0.8, 0.1), pushes=1.0), [], 1, torch.Generator())
-    assert abs(plain.w[0].item() - 0.8) > 0.1 and closure.w.tolist() == pytest.approx([0.8, 0.1], abs=0.02)
-    plant, own = DriftingLine(), Slope()
-    sensors = sensors_of(plant, ["position"])
-    records = [sensor_record(plant, sensors, one) for one in line_records((0.8, 0.1), pushes=1.0)]
-    first = FirstStates(plant, sensors)
-    records = [one._replace(guess=first.guess(one)) for one in records]
-    size = usual_sizes(plant, torch.stack([one.guess for one in records]), sensors, records)
-    parts = [part for one in records for part in chained(one, 30, plant.dt)]
-    found = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, process=2.0 * size).run(parts)
-    assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
-    assert step.report()["noise/position"] == pytest.approx(found.noise["position"], rel=1e-3)
-
-
-def test_weights_that_drift_are_followed_from_episode_to_episode():
-    """As an estimation with the belief of the one before; without the belief, each episode stands alone."""
-    step, closure = line_step(drift=0.05)
-    plant, own = DriftingLine(), Slope()
-    sensors, belief = sensors_of(plant, ["position"]), None
-    for k in range(3):
-        (storm, other), first = line_records((0.5 + 0.1 * k, 0.3)), FirstStates(plant, sensors)
-        records = [(storm, other)[k % 2]]  # each episode has one wind, which alone cannot tell the slopes apart
-        step.update(records, [], 1, torch.Generator())
-        read = [sensor_record(plant, sensors, one) for one in records]
-        read = [one._replace(guess=first.guess(one)) for one in read]
-        prior = None if belief is None else BeliefPrior(own, belief, 0.05)
-        options = EstimationConfig(rounds=4, starts=10 if prior is None else 1)
-        task = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, config=options)
-        belief = task.run(read, prior).uncertainty.belief()
-        assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
-    again, _ = line_step(drift=0.05)
-    again.load_state_dict(step.state_dict())
-    assert torch.equal(again.belief.covariance, step.belief.covariance)
-    assert closure.w.tolist() == pytest.approx([0.7, 0.3], abs=0.1)
 
 
 def test_a_biased_sensor_is_found_in_step_4():
@@ -437,14 +405,5 @@ def test_a_biased_sensor_is_found_in_step_4():
 
 
 def test_what_only_a_fit_to_sensors_takes_is_refused_without_sensors():
-    for options, message in (
-        ({"biased": ("pressure",)}, "give sensors, too"),
-        ({"pushes": 3}, "give sensors, too"),
-        ({"drift": 0.1}, "give sensors, too"),
-        ({"pushes": 0}, "pushes=0 must be at least 1"),
-        ({"drift": -1.0}, "drift=-1.0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            config(**options)
-    with pytest.raises(ValueError, match="would count them twice"):
-        TwinningConfig(records=2, assimilation=config("position", drift=0.1))
+    with pytest.raises(ValueError, match="give sensors, too"):
+        config(biased=("pressure",))

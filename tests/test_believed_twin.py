@@ -111,7 +111,13 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
         states = stepped(twin.plant, twin.closure, start, flown.exogenous, lambda k, t, s, w: flown.actions[k])
         misfits[name] = twin.plant.dt * run.physics.discrepancy(states[1:, :2], flown.states[1:, :2]).sum().item()
     assert misfits["lags"] < 0.1 * misfits[ALONE] and unseen_J_p < 0.1 * misfits[ALONE]
+    # So has its RMS error, which is told in units, with standard errors of the closure's coefficients.
+    twin = summary["twin"]
+    last = run.metrics["episodes"][-1]
+    assert twin["segment"] == 0
+    assert twin["rms"] == {key.removeprefix("rms/"): last[key] for key in last if key.startswith("rms/")}
     table = results_table(run.metrics)
+    assert "twin over its last records: RMS position" in table
     assert "beside the twin: lags" in table and "; J_p and closure weights are its own" in table
     one = {"lags": {"weight": 0.6, "weights": {}, "described": {}}}
     assert hypothesis_lines(one) == ["  beside the twin: lags, weight 0.60"]

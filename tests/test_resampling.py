@@ -34,7 +34,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.hypotheses.reread import reread
+from rt_torchrl.twinning.hypotheses.fit import reread
 
 pd = pytest.importorskip("pandas")
 

@@ -1,11 +1,11 @@
-"""The closure's weights on the terminal."""
+"""The closure's weights and the twin's errors on the terminal."""
 
 import pytest
 import torch
 
 from rt_torchrl.envs.pendulum.plant import UniformRod
 from rt_torchrl.plants.closures import described_weights
-from rt_torchrl.runs.results_table import closure_lines
+from rt_torchrl.runs.results_table import closure_lines, fit_lines, progress
 
 
 def test_true_weights_are_shown_where_they_are_known():
@@ -33,3 +33,22 @@ def test_a_meaning_without_a_coefficient_is_refused():
 
     with pytest.raises(ValueError, match="meanings of Misspelt describes mas, which names lacks"):
         Misspelt.guess(1.0)
+
+
+def test_standard_errors_stand_beside_the_weights():
+    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "true": {"a": 1.25, "b": 2.0}}
+    shown = [line.split() for line in closure_lines(closure, errors={"a": 0.25, "b": None})]
+    assert shown[1:] == [["a", "1", "1.5", "0.25", "1.25"], ["b", "2", "2.5", "-", "2"]]
+    assert shown[0] == ["closure", "weight", "start", "found", "std.", "error", "true"]
+
+
+def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
+    rms = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None, "height [m]": 2.0}
+    found = {"rms": rms, "segment": 0, "standard_errors": {}}
+    line = "RMS rotor_speed 0.0123 rad/s, shares diverges, height 2 m"
+    assert fit_lines(found) == [f"  twin over its last records: {line}"]
+    assert fit_lines(found | {"segment": 22}) == [f"  twin over segments of 22 intervals: {line}"]
+    assert fit_lines({"rms": {}, "segment": 0, "standard_errors": {}}) == fit_lines(None) == []
+    record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
+    record |= {f"rms/{name}": value for name, value in rms.items()}
+    assert progress(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"

@@ -16,7 +16,6 @@ from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
-from rt_torchrl.fit.prior import Belief, BeliefPrior
 from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import Sensor, sensors_of, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values, newey_west
@@ -112,17 +111,6 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         assert (width.high - width.low).isinf().tolist() == [False, True]
         with pytest.raises(ValueError, match="has no end, as the data say nothing of them"):
             found.ellipse("calm", "wind")
-
-
-def test_a_prior_bounds_what_the_data_do_not_say():
-    """A belief of the slope in wind from elsewhere is all that is known of it after a record in calm air."""
-    closure, generator = Slope(), torch.Generator().manual_seed(0)
-    belief = Belief(torch.tensor([0.5, 0.3]).double(), torch.diag(torch.tensor([1.0, 0.04])).double())
-    task = Estimation(DigitalTwin(Line(), closure), position())
-    values = 0.5 * TIMES + NOISE * torch.randn(81, generator=generator).double().numpy()
-    records = [sensor_record(Line(), position(), line_segment(values))]
-    found = task.run(records, BeliefPrior(closure, belief, drift=0.15)).uncertainty
-    assert found.standard_errors()["w[1]"] == pytest.approx(0.25) and not found.unknown()
 
 
 def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():

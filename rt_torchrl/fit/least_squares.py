@@ -24,8 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.likelihood import Biases, InitialStates, Likelihood
-from rt_torchrl.fit.prior import BeliefPrior, WeightPrior
+from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
 from rt_torchrl.fit.record import SensorRecord, segments
 from rt_torchrl.fit.sensors import Sensor, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
@@ -49,8 +48,12 @@ LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
 STIFFNESS = (1e-6, 1e8)
 """Range of the prior's stiffness Λ where the data choose it."""
-EXPLAINED = 0.1
+EXPLAINED = 0.5
 """RMS error of a sensor, as a share of the scatter of its readings, below which a twin explains them."""
+SHORT = 60
+"""Number of short segments of a record, which tell whether a twin is unstable."""
+GROWTH = 1e3
+"""Factor by which errors of first states grow along the records of a system that is called unstable."""
 APART = 3.0
 """Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""
 SHORTENED = 3
@@ -113,42 +116,60 @@ def multi_start(
 R = TypeVar("R")
 
 
-def over_segments(closure: nn.Module, intervals: int, fit: Callable[[int], tuple[R, Tensor]], enough: Tensor) -> R:
-    """Fit whole records, or the longest segments that the twin follows as well as shorter ones; its weights stay.
+def over_segments(
+    closure: nn.Module,
+    intervals: int,
+    fit: Callable[[int], tuple[R, Tensor]],
+    enough: Tensor,
+    unstable: Callable[[], bool],
+) -> R:
+    """Fit whole records; those of an unstable twin over the longest segments that it follows as well as shorter ones.
 
-    Where the errors over whole records are not small enough, segments of a third of them are fitted from the same
-    weights, then of a ninth, and so on.
+    Where the errors over whole records are not small enough, short segments are fitted from the same weights. If the
+    twin is stable under what these tell, it lacks something that no segment shows better, and whole records stay.
+    Otherwise segments of a third of the records are fitted, then of a ninth, and so on.
 
     Args:
-        closure: closure with the weights.
+        closure: closure with the weights; those of the fit that is returned stay.
         intervals: number of control intervals of the longest record.
         fit: function of the number of control intervals of a segment, or 0 for whole records, that moves the weights
             and returns the result and its RMS errors.
         enough: RMS errors that are small enough.
+        unstable: whether the twin is unstable under the present weights; see :meth:`Estimation.unstable`.
 
     Raises:
         FloatingPointError: if every fit diverges.
     """
     start = copy.deepcopy(closure.state_dict())
-    results, errors, weights, length = list[R](), list[Tensor](), list[dict[str, Tensor]](), 0
-    diverged: FloatingPointError | None = None
-    while length != 1 and not (errors and (errors[-1] <= enough).all()):
+    fits: dict[int, tuple[R, Tensor, dict[str, Tensor]]] = {}
+    diverged: list[FloatingPointError] = []
+
+    def explains(length: int) -> bool:
         closure.load_state_dict(start)
         try:
-            result, error = fit(length)
+            result, errors = fit(length)
         except FloatingPointError as failed:
-            diverged = diverged or failed
-        else:
-            results.append(result)
-            errors.append(error)
-            weights.append(copy.deepcopy(closure.state_dict()))
+            diverged.append(failed)
+            return False
+        fits[length] = result, errors, copy.deepcopy(closure.state_dict())
+        return bool((errors <= enough).all())
+
+    short = max(intervals // SHORT, 2)
+    whole = explains(0)
+    if not whole and short < intervals:
+        explains(short)
+        probed = fits.pop(short, None)
+        whole = 0 in fits and probed is not None and not unstable()
+    length = 0
+    while not whole and length != 1:
         length = max((length or intervals) // SHORTENED, 1)
-    if diverged is not None and not results:
-        raise diverged
-    least = torch.stack(errors).amin(0)
-    best = next(k for k, error in enumerate(errors) if (error <= APART * least).all())
-    closure.load_state_dict(weights[best])
-    return results[best]
+        whole = explains(length)
+    if not fits:
+        raise diverged[0]
+    least = torch.stack([errors for _, errors, _ in fits.values()]).amin(0)
+    result, _, weights = next(one for one in fits.values() if (one[1] <= APART * least).all())
+    closure.load_state_dict(weights)
+    return result
 
 
 @torch.no_grad()
@@ -233,7 +254,7 @@ class Estimate(NamedTuple):
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
-            if error > 5.0 * EXPLAINED * size > 0.0:
+            if error > EXPLAINED * size > 0.0:
                 warnings.append(
                     f"the twin does not explain {sensor.name}: its RMS error is {error:.3g} {sensor.measurement.unit}, "
                     f"and the readings scatter by {size:.3g}. Check columns and units, the inputs that act on the "
@@ -265,8 +286,6 @@ class Estimation:
         sensors: the sensors of all records.
         spread: standard deviation of the initial states about their guess: zero for a state that is known, infinite for
             one of which only the readings tell. None lets all be unknown.
-        process: standard deviation of what process noise does to every state from a record to one that follows it, see
-            :func:`chained`; None if there is none. No state is known then, so that no ``spread`` may be zero.
         config: parameters of the estimation.
     """
 
@@ -276,7 +295,6 @@ class Estimation:
         sensors: Sequence[Sensor],
         *,
         spread: Float[Tensor, " n_s"] | None = None,
-        process: Float[Tensor, " n_s"] | None = None,
         config: EstimationConfig | None = None,
     ):
         self.twin, self.sensors, self.config = twin, tuple(sensors), config or EstimationConfig()
@@ -288,32 +306,20 @@ class Estimation:
                 f"spread={self.spread.tolist()} of the initial states must hold one number for each of {names}: 0 for "
                 "a state that is known, or inf."
             )
-        self.process = process
-        fits = process is None or (process.shape == unknown.shape and bool((process > 0.0).all()))
-        if process is not None and not (fits and bool((self.spread > 0.0).all())):
-            raise ValueError(
-                f"process={process.tolist()} must hold a positive number for each of {names}, and no "
-                f"spread={self.spread.tolist()} may be zero beside it."
-            )
 
-    def run(self, records: Sequence[SensorRecord], belief: BeliefPrior | None = None) -> Estimate:
+    def run(self, records: Sequence[SensorRecord]) -> Estimate:
         """Estimate all unknowns from the records.
 
-        Args:
-            records: the records.
-            belief: what was believed of the weights before; None for the prior of the configuration.
-
         Raises:
-            ValueError: if there is no record, a sensor has no sample, or a record follows one without process noise.
+            ValueError: if there is no record, or a sensor has no sample.
             DivergenceError: if the twin diverges under the weights that it starts from.
         """
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
-        self._require_process(records)
-        if self.config.segment is None and self.process is None and all(r.course is not None for r in records):
-            minimum = self._longest(records, belief)
+        if self.config.segment is None and all(r.course is not None for r in records):
+            minimum = self._longest(records)
         else:
-            minimum = self._minimum(records, belief, self.config.segment or 0)
+            minimum = self._minimum(records, self.config.segment or 0)
         likelihood, prior = minimum.likelihood, minimum.likelihood.prior
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
@@ -329,12 +335,12 @@ class Estimation:
             minimum.segment,
         )
 
-    def _minimum(self, records: Sequence[SensorRecord], belief: BeliefPrior | None, length: int) -> _Minimum:
+    def _minimum(self, records: Sequence[SensorRecord], length: int) -> _Minimum:
         """Fit records, or segments of a length, from the present weights, with the noise levels that they leave."""
         closure, config = self.twin.closure, self.config
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
-        prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior) if belief is None else belief
+        prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior)
         tried = multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number))
         minimum, iterations = min(tried, key=lambda minimum: minimum.best), sum(minimum.iterations for minimum in tried)
         for _ in range(config.rounds):
@@ -344,7 +350,7 @@ class Estimation:
                 break
         return minimum._replace(iterations=iterations, segment=length)
 
-    def _longest(self, records: Sequence[SensorRecord], belief: BeliefPrior | None) -> _Minimum:
+    def _longest(self, records: Sequence[SensorRecord]) -> _Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         scatter = scatter_of(self.sensors, records)
         given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
@@ -355,12 +361,25 @@ class Estimation:
             nonlocal done
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
-            minimum = self._minimum(records, belief, length)
+            minimum = self._minimum(records, length)
             done += minimum.iterations
             return minimum, judged(minimum.likelihood).rms
 
         enough = torch.maximum(EXPLAINED * scatter, given)
-        return over_segments(self.twin.closure, max(lengths), fit, enough)._replace(iterations=done)
+        found = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
+        return found._replace(iterations=done)
+
+    def unstable(self, records: Sequence[SensorRecord]) -> bool:
+        """Whether errors of the first states grow by more than a factor of 1000 along the records.
+
+        States are measured by their usual sizes, see :func:`usual_sizes`.
+        """
+        likelihood = Estimation(self.twin, self.sensors).likelihood(records, weights=False)
+        size = likelihood.initial.unit.sum(-1)
+        try:
+            return not all((S.sensitivity.abs() / size[:, None]).max() < GROWTH for S in likelihood.replays())
+        except DivergenceError:
+            return True
 
     def likelihood(
         self,
@@ -381,42 +400,21 @@ class Estimation:
             known: whether to take the initial states as known.
         """
         noise = first_noise(self.sensors, records) if noise is None else noise
-        first = self._guesses(records)
+        first = torch.stack([record.guess for record in records])
         free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
         sizes = usual_sizes(self.twin.plant, first, self.sensors, records) if free else torch.ones_like(first[0])
+        biased = [k for k, sensor in enumerate(self.sensors) if sensor.bias]
         return Likelihood(
             self.twin,
             records,
             self.sensors,
-            InitialStates(first, free, sizes),
+            Offsets(first, free, sizes),
             noise,
             spread=self.spread.to(first.device),
-            process=None if known else self.process,
-            biases=None if known else Biases(self.sensors, noise),
+            biases=None if known else Offsets(torch.zeros_like(noise), biased, noise),
             prior=prior,
             weights=weights,
         )
-
-    @torch.no_grad()
-    def _guesses(self, records: Sequence[SensorRecord]) -> Float[Tensor, "records n_s"]:
-        """First guesses of the initial states; a record that follows begins where the twin ends the one before."""
-        guesses: list[Tensor] = []
-        for number, record in enumerate(records):
-            if record.follows and number:
-                before = records[number - 1]
-                given = (guesses[-1][None], before.exogenous[None], before.actions[None])
-                guesses.append(self.twin.replay(*given, start=before.start).states[0, -1])
-            else:
-                guesses.append(record.guess)
-        return torch.stack(guesses)
-
-    def _require_process(self, records: Sequence[SensorRecord]) -> None:
-        follows = [record.follows for record in records]
-        if any(follows) and (self.process is None or follows[0]):
-            raise ValueError(
-                "a record follows the one before it: give the estimation its process noise, process=..., and begin "
-                "with a record that follows nothing."
-            )
 
     def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
         """The likelihood of other records under the present weights, at the initial states that suit them best."""
@@ -445,9 +443,7 @@ class Estimation:
         return together._replace(iterations=done)
 
     def _staged(self, records: Sequence[SensorRecord], prior: WeightPrior) -> _Minimum:
-        done = 0
-        if self.process is None:
-            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations
+        done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations
         minimum = self._descended(self.likelihood(records, prior=prior))
         return minimum._replace(iterations=done + minimum.iterations)
 
@@ -581,14 +577,15 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
 
 
 def judged(likelihood: Likelihood) -> Judgement:
-    """The twin's errors in the samples that exist; unknown if it diverges."""
+    """The twin's errors in the samples that exist; infinite, and its readings unknown, if it diverges."""
+    records, signals = likelihood.records, [sensor.measurement for sensor in likelihood.sensors]
+    read = torch.cat([record.readings for record in records])
     try:
-        blocks = likelihood.residuals()
+        readings = likelihood.simulated()
     except DivergenceError:
-        unknown = [record.readings * torch.nan for record in likelihood.records]
-        return Judgement(torch.full_like(likelihood.noise, torch.inf), unknown, likelihood.records)
-    squares = torch.stack([(block.values * likelihood.noise).square().sum((0, 1)) for block in blocks]).sum(0)
-    return Judgement((squares / likelihood.samples).sqrt(), likelihood.simulated(), likelihood.records)
+        unknown = [record.readings * torch.nan for record in records]
+        return Judgement(torch.full_like(likelihood.noise, torch.inf), unknown, records)
+    return Judgement(differences(signals, torch.cat(readings), read).square().nanmean(0).sqrt(), readings, records)
 
 
 def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:

@@ -2,14 +2,13 @@ r"""The likelihood of sensor readings under a twin, and its derivatives by all u
 
 .. math::
     J(w, s_0, b) = \frac12\sum_{i,k,j}\Big(\frac{y^i_{kj} - h_j(s^i_k) - b_j}{\sigma_j}\Big)^2
-        + \frac12\sum_i\Big\|\frac{s^i_0 - \hat s^i_0}{\rho}\Big\|^2
-        + \frac12\sum_i\Big\|\frac{s^i_0 - s^{i-1}_n}{q}\Big\|^2 + \frac12\Lambda\|w - w^0\|^2
+        + \frac12\sum_i\Big\|\frac{s^i_0 - \hat s^i_0}{\rho}\Big\|^2 + \frac12\Lambda\|w - w^0\|^2
 
 The first sum is over the samples that exist. The unknowns are the closure's weights w, the initial states of all
-records, of which no sensor needs to read any component, and the biases b. The second sum is over records with a start
-of their own, the third over records that follow another one, from whose end process noise q parts them (weak
-constraint). J is the negative logarithm of the posterior, so that its Gauss-Newton matrix is the Fisher information of
-the unknowns. With the sensors of :func:`rt_torchrl.fit.sensors.state_sensors` the first sum is the paper's J_p.
+records, of which no sensor needs to read any component, and the biases b. The prior holds weights of which no record
+tells at their first values w⁰. J is the negative logarithm of the posterior, so that its Gauss-Newton matrix is the
+Fisher information of the unknowns. With the sensors of :func:`rt_torchrl.fit.sensors.state_sensors` the first sum is
+the paper's J_p.
 """
 
 import math
@@ -19,13 +18,14 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
-from rt_torchrl.fit.prior import WeightPrior
 from rt_torchrl.fit.record import SensorRecord, held_to_the_end
 from rt_torchrl.fit.sensors import Sensor, read, read_slopes, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
+from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import Actions, Inputs
+from rt_torchrl.plants.shapes import Actions, Inputs, States
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -33,47 +33,66 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
 
 
-class InitialStates(nn.Module):
-    """Initial state s_0 of every record: a first guess plus trainable offsets.
+class WeightPrior:
+    """The prior of the weights of a closure's perceptrons (:class:`BoundedPerceptron`), centred on the present ones.
+
+    Other weights, such as constants of the physics, are free.
 
     Args:
-        guess: first guess of the initial state of every record.
-        free: indices of the states that have an offset.
-        scale: unit of the offset of each state, so that a step of 1 is neither long nor short.
+        closure: closure with the weights.
+        stiffness: factor Λ of all weights of perceptrons.
+        device: device for a closure without trained weights.
+    """
+
+    def __init__(self, closure: nn.Module, stiffness: float, *, device: torch.device | str = "cpu"):
+        self.closure, self.stiffness, self._device = closure, stiffness, device
+        self.start = self.weights().detach().clone()
+        held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
+        trained = [w for w in closure.parameters() if w.requires_grad]
+        each = [torch.full_like(w.detach().flatten(), float(id(w) in held)) for w in trained]
+        self.held = torch.cat(each) if each else self.start
+
+    def weights(self) -> Tensor:
+        """The trained weights in one vector."""
+        trained = [w.flatten() for w in self.closure.parameters() if w.requires_grad]
+        return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64, device=self._device)
+
+    def cost(self) -> Tensor:
+        """The cost, differentiable by the weights."""
+        return 0.5 * self.stiffness * (self.held * (self.weights() - self.start).square()).sum()
+
+    def added(self, found: NormalEquations) -> NormalEquations:
+        """Normal equations, whose first unknowns are the weights, with the prior."""
+        if not self.stiffness:
+            return found
+        rest = len(found.gradient) - len(self.start)
+        each = self.stiffness * self.held
+        pull = pad(each * (self.weights() - self.start), (0, rest))
+        matrix = found.matrix + torch.diag(pad(each, (0, rest)))
+        return NormalEquations(found.cost + self.cost(), found.gradient + pull, matrix)
+
+
+class Offsets(nn.Module):
+    """First guesses of values, of which some have a trainable offset: first states of records, biases of sensors.
+
+    Args:
+        guess: the guesses.
+        free: places of the values that have an offset.
+        scale: unit of each offset, so that a step of 1 is neither long nor short.
     """
 
     guess: Tensor
     unit: Tensor
 
-    def __init__(self, guess: Float[Tensor, "records n_s"], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+    def __init__(self, guess: Float[Tensor, "*records n"], free: Sequence[int], scale: Float[Tensor, " n"]):
         super().__init__()
         self.register_buffer("guess", guess)
         self.register_buffer("unit", torch.diag(scale)[list(free)])
         self.free = tuple(free)
-        self.offsets = nn.Parameter(scale.new_zeros(len(guess), len(self.free)))
+        self.offsets = nn.Parameter(scale.new_zeros(*guess.shape[:-1], len(self.free)))
 
-    def forward(self) -> Float[Tensor, "records n_s"]:
+    def forward(self) -> Float[Tensor, "*records n"]:
         return self.guess + self.offsets @ self.unit
-
-
-class Biases(nn.Module):
-    """Constant offsets of the sensors that have one, zero at first.
-
-    Args:
-        sensors: all sensors.
-        scale: unit of the offset of each sensor, so that a step of 1 is neither long nor short.
-    """
-
-    unit: Tensor
-
-    def __init__(self, sensors: Sequence[Sensor], scale: Float[Tensor, " n_y"]):
-        super().__init__()
-        biased = [k for k, sensor in enumerate(sensors) if sensor.bias]
-        self.register_buffer("unit", torch.diag(scale)[biased])
-        self.offsets = nn.Parameter(scale.new_zeros(len(biased)))
-
-    def forward(self) -> Float[Tensor, " n_y"]:
-        return self.offsets @ self.unit
 
 
 class Group(NamedTuple):
@@ -105,7 +124,6 @@ class Residuals(NamedTuple):
     ``jacobian`` holds derivatives by the unknowns of each record, whose places among all unknowns are ``places``.
     """
 
-    numbers: list[int]
     seen: Bool[Tensor, "batch samples n_r"]
     values: Float[Tensor, "batch samples n_r"]
     jacobian: Float[Tensor, "batch samples n_r n_local"]
@@ -122,8 +140,6 @@ class Likelihood:
         initial: initial states of the records; their offsets come next.
         noise: standard deviation σ of each sensor.
         spread: standard deviation ρ of the initial states about their guess; infinite for none.
-        process: standard deviation q of what process noise does to every state between two records that follow each
-            other; None if no record follows.
         biases: offsets of the sensors, which come last; None for none.
         prior: prior of the closure's weights; None for none.
         weights: whether the closure's weights are unknowns.
@@ -134,19 +150,18 @@ class Likelihood:
         twin: DigitalTwin,
         records: Sequence[SensorRecord],
         sensors: Sequence[Sensor],
-        initial: InitialStates,
+        initial: Offsets,
         noise: Float[Tensor, " n_y"],
         *,
         spread: Float[Tensor, " n_s"] | None = None,
-        process: Float[Tensor, " n_s"] | None = None,
-        biases: Biases | None = None,
+        biases: Offsets | None = None,
         prior: WeightPrior | None = None,
         weights: bool = True,
     ):
         self.twin, self.records, self.sensors = twin, list(records), tuple(sensors)
         self.initial, self.noise, self.prior = initial, noise, prior
         self.spread = torch.full_like(initial.guess[0], math.inf) if spread is None else spread
-        self.biases, self.process = biases or Biases((), noise), process
+        self.biases = biases or Offsets(torch.zeros_like(noise), (), noise)
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._shown = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
@@ -166,6 +181,13 @@ class Likelihood:
         times, places = start.unsqueeze(-1) + clock, torch.stack([self._places(i) for i in numbers])
         return Group(numbers, readings, ~readings.isnan(), actions, exogenous, times, places)
 
+    def _places(self, number: int) -> Int[Tensor, " n_local"]:
+        free = len(self.initial.free)
+        first = self._shown + number * free
+        last = self._shown + self.initial.offsets.numel()
+        ranges = [(0, self._shown), (first, first + free), (last, self.count)]
+        return torch.cat([torch.arange(*ends, device=self.noise.device) for ends in ranges])
+
     @property
     def plant(self) -> Plant:
         return self.twin.plant
@@ -182,10 +204,9 @@ class Likelihood:
 
     @property
     def first_stiffness(self) -> Float[Tensor, "records n_free"]:
-        """Stiffness of the offsets of every initial state about its guess; zero for a record that follows another."""
+        """Stiffness of the offsets of every initial state about its guess."""
         stiffness = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
-        first = [float(not record.follows) for record in self.records]
-        return stiffness.new_tensor(first)[:, None] * stiffness
+        return stiffness.expand(len(self.records), -1)
 
     @torch.no_grad()
     def replays(self) -> list[Replays]:
@@ -211,20 +232,20 @@ class Likelihood:
         return Replays(group, torch.cat([first.unsqueeze(1), ends], 1), torch.cat([at_start, S], 1))
 
     @torch.no_grad()
-    def residuals(self, replays: Sequence[Replays] | None = None) -> list[Residuals]:
+    def residuals(self) -> list[Residuals]:
         """Residuals of all records, in groups of equal length.
 
-        Args:
-            replays: result of :meth:`replays` with the present unknowns; None computes it.
+        Raises:
+            DivergenceError: if a state is not finite.
         """
-        return [self._residuals(replay) for replay in (self.replays() if replays is None else replays)]
+        return [self._residuals(replay) for replay in self.replays()]
 
     def _residuals(self, replay: Replays) -> Residuals:
         group, states, S = replay
-        seen = group.seen
-        weights = seen / self.noise
-        values = differences([sensor.measurement for sensor in self.sensors], self._read(replay), group.readings)
-        values = torch.where(seen, values, 0.0) * weights
+        weights = group.seen / self.noise
+        read = self._read(group, states)
+        values = differences([sensor.measurement for sensor in self.sensors], read, group.readings)
+        values = torch.where(group.seen, values, 0.0) * weights
         if None in self._states:
             given = (self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous))
             jacobian = read_slopes(*given) @ S
@@ -232,20 +253,24 @@ class Likelihood:
             jacobian = S[:, :, self._states]
         by_bias = self.biases.unit.T.expand(*values.shape, -1)
         jacobian = torch.cat([jacobian, by_bias], -1) * weights.unsqueeze(-1)
-        return Residuals(group.numbers, seen, values, jacobian, group.places)
+        return Residuals(group.seen, values, jacobian, group.places)
 
-    def _read(self, replay: Replays) -> Float[Tensor, "batch samples n_y"]:
+    def _read(self, group: Group, states: States) -> Float[Tensor, "batch samples n_y"]:
         """What the sensors read, bias included."""
-        group, states, _ = replay
-        inputs = held_to_the_end(group.exogenous)
-        return read(self.sensors, self.plant, group.times, states, inputs) + self.biases()
+        return read(self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous)) + self.biases()
 
     @torch.no_grad()
     def simulated(self) -> list[Float[Tensor, "samples n_y"]]:
-        """What the sensors would read along every record, bias included, whether there is a sample or not."""
+        """What the sensors would read along every record, bias included, whether there is a sample or not.
+
+        Raises:
+            DivergenceError: if a state is not finite.
+        """
         readings: dict[int, Tensor] = {}
-        for replay in self.replays():
-            readings |= dict(zip(replay.group.numbers, self._read(replay), strict=True))
+        for group in self._groups:
+            first, start = self.initial()[group.numbers], group.times[:, 0]
+            flown = self.twin.replay(first, group.exogenous, group.actions, start=start)
+            readings |= dict(zip(group.numbers, self._read(group, flown.states), strict=True))
         return [readings[number] for number in range(len(self.records))]
 
     @torch.no_grad()
@@ -256,72 +281,26 @@ class Likelihood:
             residuals: result of :meth:`residuals` with the present unknowns; None computes it.
         """
         like = self.initial.guess
-        gradient, matrix = like.new_zeros(self.count), like.new_zeros(self.count, self.count)
-        cost = like.new_zeros(())
-        replays = self.replays() if residuals is None or self.process is not None else []
-        blocks = self.residuals(replays) if residuals is None else residuals
-        for block in (*blocks, *self.pushes(replays)):
+        cost, gradient = like.new_zeros(()), like.new_zeros(self.count)
+        matrix = like.new_zeros(self.count, self.count)
+        for block in self.residuals() if residuals is None else residuals:
             r, A, places = block.values.flatten(1), block.jacobian.flatten(1, 2), block.places
             if not self.initial.free:  # all records have the same unknowns
                 r, A, places = r.reshape(1, -1), A.reshape(1, -1, A.shape[-1]), places[:1]
             cost = cost + 0.5 * r.square().sum()
             gradient.index_put_((places,), (A.mT @ r.unsqueeze(-1)).squeeze(-1), accumulate=True)
             matrix.index_put_((places.unsqueeze(-1), places.unsqueeze(-2)), A.mT @ A, accumulate=True)
-        equations = self._with_first_states(NormalEquations(cost, gradient, matrix))
-        return self.prior.added(equations) if self.prior is not None and self._shown else equations
-
-    def _with_first_states(self, equations: NormalEquations) -> NormalEquations:
-        """The equations with the prior of the initial states."""
         stiffness, offsets = self.first_stiffness, self.initial.offsets
         held = slice(self._shown, self._shown + offsets.numel())
-        equations.gradient[held] += (stiffness * offsets).flatten()
-        equations.matrix.diagonal()[held] += stiffness.flatten()
-        return equations._replace(cost=equations.cost + 0.5 * (stiffness * offsets.square()).sum())
-
-    @torch.no_grad()
-    def pushes(self, replays: Sequence[Replays] | None = None) -> list[Residuals]:
-        """What process noise does to the states between records that follow each other, in units of q."""
-        if self.process is None:
-            return []
-        states: dict[int, tuple[Tensor, Tensor]] = {}
-        for replay in self.replays() if replays is None else replays:
-            ends = zip(replay.states[:, [0, -1]], replay.sensitivity[:, [0, -1]], strict=True)
-            states |= dict(zip(replay.group.numbers, ends, strict=True))
-        pushes, biases = [], self.biases.offsets.numel()
-        for number, record in enumerate(self.records):
-            if not record.follows:
-                continue
-            (s, S), (before, S_before) = states[number], states[number - 1]
-            values = differences(self.plant.states, s[0], before[1]) / self.process
-            own_jacobian, places = S[0][:, self._shown :], self._places(number)
-            rest = self._places(number - 1)
-            jacobian = torch.cat([-S_before[1], own_jacobian], -1) / self.process[:, None]
-            kept = slice(len(rest) - biases)
-            joined = torch.cat([rest[kept], places[self._shown : len(places) - biases]])
-            pushes.append(
-                Residuals(
-                    [number],
-                    torch.ones_like(values, dtype=torch.bool)[None, None],
-                    values[None, None],
-                    jacobian[None, None],
-                    joined[None],
-                )
-            )
-        return pushes
+        gradient[held] += (stiffness * offsets).flatten()
+        matrix.diagonal()[held] += stiffness.flatten()
+        equations = NormalEquations(cost + 0.5 * (stiffness * offsets.square()).sum(), gradient, matrix)
+        return self.prior.added(equations) if self.prior is not None and self._shown else equations
 
     def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
         """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
-        n = self.weight_count
-        stiffness = self.first_stiffness.flatten()
+        n, stiffness = self.weight_count, self.first_stiffness.flatten()
         determined = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
-        for push in self.pushes():
-            A, (places,) = push.jacobian[0, 0], push.places
-            determined = determined + (A.T @ A * inverse[places[:, None], places]).sum()
-        return float(determined if self.prior is None else determined + self.prior.determined(inverse))
-
-    def _places(self, number: int) -> Int[Tensor, " n_local"]:
-        free = len(self.initial.free)
-        first = self._shown + number * free
-        last = self._shown + self.initial.offsets.numel()
-        ranges = [(0, self._shown), (first, first + free), (last, self.count)]
-        return torch.cat([torch.arange(*ends, device=self.noise.device) for ends in ranges])
+        if self.prior is not None:
+            determined = determined + (self.prior.stiffness * self.prior.held * inverse.diagonal()[:n]).sum()
+        return float(determined)

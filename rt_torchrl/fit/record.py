@@ -24,7 +24,6 @@ class SensorRecord(NamedTuple):
         exogenous: exogenous inputs z, held over the same intervals.
         guess: first guess of the state in t_0.
         start: time t_0 on the plant's clock [s].
-        follows: whether the record begins where the one before it in a list ends, up to process noise.
         course: guesses of the states in all samples, from which parts of the record begin; None if there are none.
     """
 
@@ -33,7 +32,6 @@ class SensorRecord(NamedTuple):
     exogenous: Float[Tensor, "n n_z"]
     guess: Float[Tensor, " n_s"]
     start: float = 0.0
-    follows: bool = False
     course: Float[Tensor, "n+1 n_s"] | None = None
 
     @property
@@ -81,36 +79,25 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
     return [SensorRecord(y, a, z, course[0], start, course=course) for y, a, z, course, start in each]
 
 
-def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
-    """A record cut into parts, of which each follows the one before.
+def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
+    """A record cut into segments, each with a first state of its own (multiple shooting).
 
-    An estimation with process noise then finds by how much the states are pushed from part to part. The sample at a cut
-    belongs to the part that ends there.
+    The sample at a cut belongs to the segment that ends there.
 
     Args:
         record: the record.
-        length: number of control intervals of a part; the last part takes what is left.
+        length: number of control intervals of a segment; the last one takes what is left.
         dt: control interval [s].
-
-    Raises:
-        ValueError: if the length is below 1.
     """
-    if length < 1:
-        raise ValueError(f"length={length} of the parts of a record must be at least 1 control interval.")
     n, parts = len(record.actions), []
     for first in range(0, n, length):
         part = record.part(first, min(first + length, n), dt)
         if first:
             readings = part.readings.clone()
             readings[0] = torch.nan
-            part = part._replace(readings=readings, follows=True)
+            part = part._replace(readings=readings)
         parts.append(part)
     return parts
-
-
-def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
-    """A record cut into segments, each with a first state of its own (multiple shooting); see :func:`chained`."""
-    return [part._replace(follows=False) for part in chained(record, length, dt)]
 
 
 def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:

@@ -27,7 +27,6 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
 from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.fit.prior import Belief
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
@@ -38,8 +37,6 @@ HIGH_CORRELATION = 0.99
 
 LEAST_EIGENVALUE = 1e-12
 """Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
-UNKNOWN = 1e4
-"""Standard deviation of weights of which nothing is known, where a step of 1 is neither long nor short."""
 
 
 class Interval(NamedTuple):
@@ -96,12 +93,6 @@ class Uncertainty:
     def _free(self) -> Float[Tensor, "n_named n_null"]:
         """Changes of the named values in the directions of which nothing is known."""
         return self._slopes @ self.null[: self.likelihood.weight_count]
-
-    def belief(self) -> Belief:
-        """What the estimation has found of the weights; directions of which the data say nothing stay unknown."""
-        weights = [w.detach().flatten() for w in self.likelihood.twin.closure.parameters() if w.requires_grad]
-        null = self.null[: self.likelihood.weight_count] / self.null.norm(dim=0)
-        return Belief(torch.cat(weights), self.weights_covariance + UNKNOWN**2 * null @ null.T)
 
     def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the data say nothing.

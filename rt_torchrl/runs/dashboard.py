@@ -117,6 +117,8 @@ class Dashboard:
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
                 self._scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
+            elif key.startswith("rms/"):
+                self._scalar(f"twin/{key}", record[key], step)
         self._texts(record, step)
         for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
             self._scalar(key, record[key], step)

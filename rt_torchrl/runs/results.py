@@ -108,10 +108,28 @@ def summarise(
         "better_chosen_on": chosen_on,
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
+        "twin": fit_of(algorithm),
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "hypotheses": hypotheses_of(algorithm.twin),
         "believed": algorithm.twin.hypothesis,
         "seconds": seconds_per_step(episodes),
+    }
+
+
+def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
+    """How the believed twin replays the records that it was last fitted to.
+
+    ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
+    0; ``standard_errors`` those of the closure's coefficients.
+    """
+    records, assimilation = list(algorithm.short_term), algorithm.assimilation
+    if not records or algorithm.config.arm == "model_free":
+        return {"rms": {}, "segment": 0, "standard_errors": {}}
+    latest, _ = algorithm.virtual.paired(records)
+    return {
+        "rms": assimilation.rms_errors(latest),
+        "segment": assimilation.length,
+        "standard_errors": assimilation.standard_errors(latest),
     }
 
 

@@ -1,5 +1,6 @@
 """The results of a run on the terminal: the progress line and the table at the end."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from rt_torchrl.twinning.findings import in_words
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""
 LEAST_WEIGHTS = 4
+MOST_ERRORS = 2
+"""Number of RMS errors of the twin on the progress line."""
 WHERE = {
     "simulation of the real system": " in simulation, with the closure that the real system was given",
     "twin": " on the twin, not on the real system",
@@ -22,10 +25,26 @@ WHERE = {
 
 def progress(record: dict[str, Any]) -> str:
     """The costs of an episode and its live policy, as the progress bar shows them."""
-    costs = [(name, record.get(key)) for name, key in (("J_p", "J_p"), ("J_a mb", "J_a_model_based"))]
-    costs += [("J_a mf", record.get("J_a_model_free")), ("real", record["real_cost"])]
-    shown = [f"{name} {in_words(value)}" for name, value in costs if value is not None]
-    return ", ".join([*shown, f"live {record['live'].replace('_', '-')}"])
+    errors = {key.removeprefix("rms/"): value for key, value in record.items() if key.startswith("rms/")}
+    named = [("J_a mb", "J_a_model_based"), ("J_a mf", "J_a_model_free"), ("real", "real_cost")]
+    named = named if errors else [("J_p", "J_p"), *named]
+    shown = [f"{name} {in_words(record[key])}" for name, key in named if record.get(key) is not None]
+    return ", ".join([*rms_words(errors, most=MOST_ERRORS), *shown, f"live {record['live'].replace('_', '-')}"])
+
+
+def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
+    """RMS errors of the twin in words, each with its unit; None stands for one that is not finite.
+
+    Args:
+        errors: the errors, by ``STATE [UNIT]``.
+        most: greatest number of errors that are shown.
+    """
+    words = []
+    for label, value in list(errors.items())[:most]:
+        name, unit = label.removesuffix("]").split(" [")
+        finite = value is not None and math.isfinite(value)
+        words.append(f"{name} {value:.3g} {unit}".removesuffix(" -") if finite else f"{name} diverges")
+    return [f"RMS {words[0]}", *words[1:]] if words else []
 
 
 def results_table(metrics: dict[str, Any]) -> str:
@@ -68,8 +87,10 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
+    lines += fit_lines(found.get("twin"))
     room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
-    lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room))
+    errors = found.get("twin", {}).get("standard_errors", {})
+    lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room), errors=errors)
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
 
@@ -146,17 +167,28 @@ def _value(found: dict[str, Any]) -> str:
     return _number(found["mean"], ".4g") + (f" ({_number(found['median'], '.4g')})" if "median" in found else "")
 
 
-def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
+def fit_lines(twin: dict[str, Any] | None) -> list[str]:
+    """A line with the twin's RMS errors over the records, or the segments, that it was last fitted to."""
+    if not twin or not twin["rms"]:
+        return []
+    where = f"segments of {twin['segment']} intervals" if twin["segment"] else "its last records"
+    return [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
+
+
+def closure_lines(
+    closure: dict[str, Any], most: int = 1000, errors: dict[str, float | None] | None = None
+) -> list[str]:
     """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
 
-    The true weights of the same names are shown, if there are any. Of more weights than ``most``, those are shown that
-    have changed most.
+    The true weights of the same names and the standard errors are shown, if there are any. Of more weights than
+    ``most``, those are shown that have changed most.
     """
     if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
     described = closure.get("described", {})  # runs of 0.1.0 have none
-    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'true':>12}" if true else "")]
+    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'std. error':>12}" if errors else "")]
+    lines[0] += f"{'true':>12}" if true else ""
     chosen = list(closure["found"])
     if len(chosen) > most:
         change = {name: _change(closure["start"].get(name), closure["found"][name]) for name in chosen}
@@ -164,7 +196,11 @@ def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
         chosen = [name for name in chosen if name in moved]
     for name in chosen:
         value = closure["found"][name]
-        weights = [closure["start"].get(name), value, *([true.get(name)] if true else [])]
+        weights = [closure["start"].get(name), value]
+        if errors:
+            weights.append(errors.get(name))
+        if true:
+            weights.append(true.get(name))
         about = described.get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{about['unit']}]" if about["unit"] else name
         shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)

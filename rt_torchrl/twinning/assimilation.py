@@ -1,4 +1,4 @@
-"""Step 4: the closure is trained until the twin replays the record."""
+"""Step 4: the closure is trained until the twin replays the record, or what some sensors have read of it."""
 
 import contextlib
 import copy
@@ -8,22 +8,40 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.least_squares import EXPLAINED, NOISE_TOLERANCE, Estimation, multi_start, over_segments
-from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.fit.prior import WeightPrior
+from rt_torchrl.fit.least_squares import (
+    EXPLAINED,
+    NOISE_TOLERANCE,
+    Estimate,
+    Estimation,
+    EstimationConfig,
+    judged,
+    multi_start,
+    over_segments,
+    scatter_of,
+)
+from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
 from rt_torchrl.fit.record import SensorRecord, sensor_records
-from rt_torchrl.fit.sensors import state_places, state_sensors
+from rt_torchrl.fit.sensors import Sensor, sensors_of, state_places, state_sensors, with_biases
+from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
 from rt_torchrl.steps.inputs import ExogenousProcess
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 DAMPING = 1e-3
 """Damping μ of the first fit by Levenberg-Marquardt."""
+STARTS = 10
+"""Number of first weights in the first episode of a fit to sensors: one sensor may leave several local minima."""
+ROUNDS = 4
+"""Greatest number of rounds in which the noise levels follow the residuals, in an episode."""
+DRAWS = 200
+"""Number of initial states that a plant draws, to learn how hidden ones depend on those that are read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +65,9 @@ class AssimilationConfig:
             keep their initial values, and so the law keeps its initial form where no record has been.
         segment: number of control intervals after which the replay starts again from the measured state (multiple
             shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
-            weights, so a closure with many weights fits the record in a few steps. The J_p that descends is then the
-            mean over the segments. None lets the data choose: whole records, unless the twin leaves them where it
-            follows shorter segments, as with an unstable system; J_p is then told over the segments that are chosen.
+            weights, so a closure with many weights fits the record in a few steps. J_p is then the mean over the
+            segments. None lets the data choose: whole records, unless the twin is unstable and leaves
+            them; then the longest segments that it follows as well as shorter ones.
         initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
@@ -58,14 +76,8 @@ class AssimilationConfig:
             likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
             states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
             the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
-            ``levenberg_marquardt``, the inputs of the ``record``, ``initial="estimated"`` and whole records.
+            ``levenberg_marquardt``, the inputs of the ``record`` and ``initial="estimated"``.
         biased: names of the sensors that may be off by a constant, which is estimated.
-        pushes: number of parts of a record between which something beside the twin may push the states (weak
-            constraint); 1 for none. The pushes are unknowns beside the weights, which they then bend no longer.
-        push: size of a push, its standard deviation as a share of each state's usual size.
-        drift: standard deviation by which each weight of the closure may change from episode to episode, where a change
-            of 1 is a factor of e for a logarithm. What earlier episodes told is then kept as a belief that fades, and
-            each episode adds its record. With 0 the records alone tell the weights.
         descent: parameters of the closure's descent.
     """
 
@@ -75,13 +87,10 @@ class AssimilationConfig:
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     starts: int = 1
     prior: float = 0.0
-    segment: int | None = 0
+    segment: int | None = None
     initial: Literal["measured", "estimated"] = "measured"
     sensors: tuple[str, ...] = ()
     biased: tuple[str, ...] = ()
-    pushes: int = 1
-    push: float = 0.01
-    drift: float = 0.0
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
@@ -99,28 +108,19 @@ class AssimilationConfig:
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
             )
-        if self.sensors and (self.initial != "estimated" or self.segment != 0):
+        if self.sensors and (self.initial != "estimated" or self.segment):
             raise ValueError(
-                f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
+                f"sensors={self.sensors} of the assimilation need initial='estimated' and no segment; they are "
                 f"{self.initial!r} and {self.segment}."
+            )
+        if self.biased and not self.sensors:
+            raise ValueError(
+                f"biased={self.biased} of the assimilation belongs to a fit to sensors; give sensors, too."
             )
         if self.starts < 1 or (self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured")):
             raise ValueError(
                 f"starts={self.starts} of the assimilation must be at least 1, and more than 1 need "
                 f"method='levenberg_marquardt' and initial='measured', not {self.method!r} and {self.initial!r}."
-            )
-        self._check_likelihood()
-
-    def _check_likelihood(self) -> None:
-        """Check what only a fit to sensors takes."""
-        if self.pushes < 1 or not self.push > 0.0:
-            raise ValueError(f"pushes={self.pushes} must be at least 1, and push={self.push} positive.")
-        if not self.drift >= 0.0:
-            raise ValueError(f"drift={self.drift} of the closure's weights must not be negative.")
-        if not self.sensors and (self.biased or self.pushes > 1 or self.drift):
-            raise ValueError(
-                f"biased={self.biased}, pushes={self.pushes} and drift={self.drift} of the assimilation belong to a "
-                "fit to sensors; give sensors, too."
             )
 
 
@@ -152,6 +152,9 @@ class Assimilation:
         if config.initial == "estimated":
             spread[[k for k in state_places(twin.plant, sensors) if k is not None]] = math.inf
         self._problem = Estimation(twin, sensors, spread=spread)
+        self.length = config.segment or 0
+        """Number of control intervals of the segments of the last fit; 0 for whole records."""
+        self._records: Sequence[Trajectory] = ()
         self.begin()
 
     def begin(self) -> None:
@@ -180,33 +183,58 @@ class Assimilation:
             generator: source of the realisations.
 
         Returns:
-            J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
+            J_p before and after, without the prior, and the descent's gradient and iterations. J_p is the mean over
+            the records, or over the segments that the fit uses.
             J_p before is infinite if the twin diverges on the records; the fit then begins anew from the first closure.
             Where the twin diverges under that, too, all are infinite, and the closure stays as it is.
         """
-        whole = batch_of(records)
+        self._records, whole = records, batch_of(records)
         if self.config.inputs == "realisations":
             sampled = torch.cat([process.sample(count, generator) for process in processes])
             rows = torch.arange(len(whole.states), device=sampled.device).repeat_interleave(count)
             whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
-        if self.config.segment is None and self.config.iterations:
-            return self._over_segments(whole)
-        if not self.config.segment:
+        if self.config.sensors or not self.config.iterations:
             return self._descend_anew(whole)
-        before = self.cost_of(whole)
-        found = self._descend_anew(whole.segments(min(self.config.segment, whole.actions.shape[1]), self.twin.plant.dt))
-        return found._replace(start=before, best=self.cost_of(whole))
+        if self.config.segment is None:
+            return self._over_chosen_segments(whole)
+        return self._over(whole, self.length)
 
-    def _over_segments(self, whole: Trajectory) -> Descended:
-        """Descend over whole records, or over the longest segments that the twin follows as well as shorter ones."""
-        plant, intervals = self.twin.plant, whole.actions.shape[1]
-        scatter = plant.discrepancy(whole.states, whole.states.mean(1, keepdim=True).expand_as(whole.states)).mean()
+    def _over(self, whole: Trajectory, length: int) -> Descended:
+        """Descend over segments of a number of control intervals, or whole records with 0."""
+        self.length = min(length, whole.actions.shape[1])
+        return self._descend_anew(self.in_segments(whole))
 
-        def fit(length: int) -> tuple[Descended, Tensor]:
-            found = self._descend_anew(whole.segments(length, plant.dt) if length else whole)
-            return found, torch.tensor(found.best / (plant.dt * (length or intervals)), dtype=torch.float64).sqrt()
+    def in_segments(self, whole: Trajectory) -> Trajectory:
+        """Records as the last fit replayed them: in segments, or whole."""
+        return whole.segments(self.length, self.twin.plant.dt) if self.length else whole
 
-        return over_segments(self.twin.closure, intervals, fit, EXPLAINED * scatter.sqrt().cpu())
+    def _over_chosen_segments(self, whole: Trajectory) -> Descended:
+        """Descend over whole records, or over segments if the twin is unstable and leaves these."""
+        sensors, begun = self._problem.sensors, copy.deepcopy(self._progress())
+        records = sensor_records(self.twin.plant, sensors, whole)
+
+        def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
+            self._resume(copy.deepcopy(begun))
+            found = self._over(whole, length)
+            return (found, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
+
+        found, self.length, progress = over_segments(
+            self.twin.closure,
+            whole.actions.shape[1],
+            fit,
+            EXPLAINED * scatter_of(sensors, records),
+            lambda: self._problem.unstable(records),
+        )
+        self._resume(progress)
+        return found
+
+    def _progress(self) -> dict[str, Any]:
+        """What the next descent depends on, except the closure."""
+        return {"descent": self.descent.state_dict(), "damping": self.damping}
+
+    def _resume(self, progress: dict[str, Any]) -> None:
+        self.descent.load_state_dict(progress["descent"])
+        self.damping = progress["damping"]
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:
         """Descend from the present closure, or from the first one if the twin diverges under the present one.
@@ -283,7 +311,21 @@ class Assimilation:
         """What J_p compares of records, and the noise with which the likelihood is the mean over them."""
         sensors, count = self._problem.sensors, len(replayed.states)
         noise = replayed.states.new_tensor([math.sqrt(count) * (sensor.noise or 1.0) for sensor in sensors])
-        return sensor_records(self.twin.plant, sensors, replayed), noise
+        records = sensor_records(self.twin.plant, sensors, replayed)
+        if self.config.initial == "measured":  # no error is seen where a replay begins
+            for record in records:
+                record.readings[0] = math.nan
+        return records, noise
+
+    def _rms(self, replayed: Trajectory) -> Float[Tensor, " n_y"]:
+        """RMS error of every state that J_p compares; infinite if the twin diverges."""
+        records, noise = self._compared(replayed)
+        if self.config.initial == "measured":
+            return judged(self._problem.likelihood(records, noise)).rms
+        try:
+            return judged(self._problem.fit_initial_states(records, noise)).rms
+        except FloatingPointError:
+            return torch.full_like(noise, math.inf)
 
     def normal_equations(self, replayed: Trajectory) -> NormalEquations:
         """J_p, gradient and Gauss-Newton matrix by all unknowns; DivergenceError if a state is not finite."""
@@ -298,19 +340,157 @@ class Assimilation:
         return False
 
     def report(self) -> Mapping[str, float | str]:
-        """What the last update has found beside J_p, by name; of one twin, nothing."""
+        """What the last update has found beside J_p: ``rms/STATE [UNIT]`` of :meth:`rms_errors`."""
+        return {f"rms/{name}": error for name, error in self.rms_errors(self._records).items()}
+
+    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """RMS error of every state that J_p compares, by ``STATE [UNIT]``, over the segments that the last fit used.
+
+        The twin replays the measured inputs; an error is infinite where it diverges.
+        """
+        if not records:
+            return {}
+        signals = [sensor.measurement for sensor in self._problem.sensors]
+        errors = self._rms(self.in_segments(batch_of(records))).tolist()
+        return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
+
+    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """Robust standard errors of the closure's named coefficients; none where the twin diverges or names nothing.
+
+        The residuals over the segments that the last fit used tell the noise; see
+        :class:`rt_torchrl.fit.uncertainty.Uncertainty`.
+        """
+        if not records or not hasattr(self.twin.closure, "named_coefficients"):
+            return {}
+        replayed = self.in_segments(batch_of(records))
+        read, noise = self._compared(replayed)
+        noise = torch.maximum(self._rms(replayed), 1e-9 * noise)
+        with contextlib.suppress(FloatingPointError):
+            likelihood = self._problem.likelihood(read, noise)
+            if self.config.initial == "estimated":
+                likelihood.initial.load_state_dict(self._problem.fit_initial_states(read, noise).initial.state_dict())
+            return Uncertainty(likelihood, errors="robust").standard_errors()
         return {}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return {"descent": self.descent.state_dict(), "damping": self.damping, "first": self.first}
+        return self._progress() | {"first": self.first}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.descent.load_state_dict(state["descent"])
-        self.damping = state["damping"]
-        if "first" in state:  # earlier versions did not save it
-            closure = self.twin.closure
-            present = copy.deepcopy(closure.state_dict())
-            closure.load_state_dict(state["first"])
-            self.begin()
-            closure.load_state_dict(present)
+        self._resume(state)
+        closure = self.twin.closure
+        present = copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(state["first"])
+        self.begin()
+        closure.load_state_dict(present)
+
+
+class SensorAssimilation(Assimilation):
+    """Estimates weights, first states and noise levels from some sensors; of records it uses nothing else.
+
+    Args:
+        twin: twin whose closure is updated in place.
+        config: parameters of step 4, with ``sensors``.
+
+    Raises:
+        ValueError: if the plant has no such state or measurement.
+    """
+
+    def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
+        super().__init__(twin, config)
+        self.sensors = with_biases(sensors_of(twin.plant, config.sensors), config.biased)
+        self.estimate: Estimate | None = None
+        self.begun = False
+
+    def _descend(self, replayed: Trajectory) -> Descended:
+        config, first = self.config, FirstStates(self.twin.plant, self.sensors)
+        if not config.iterations:
+            return Descended(math.nan, math.nan, math.nan, 0)
+        records = sensor_records(self.twin.plant, self.sensors, replayed)
+        records = [record._replace(guess=first.guess(record), course=None) for record in records]
+        starts = 1 if self.begun else STARTS
+        options = EstimationConfig(iterations=config.iterations, rounds=ROUNDS, prior=config.prior, starts=starts)
+        estimation = Estimation(self.twin, self.sensors, spread=first.spread, config=options)
+        start = [w.detach().clone() for w in self.twin.closure.parameters()]
+        self.estimate, self.begun = estimation.run(records), True
+        found = [w.detach().clone() for w in self.twin.closure.parameters()]
+        noise, samples = self.estimate.likelihood.noise, sum(int(record.seen.sum()) for record in records)
+        costs = [self._misfit(estimation, records, noise, weights) for weights in (start, found)]
+        before, after = (found.cost.item() / samples for found in costs)
+        return Descended(before, after, costs[0].gradient.norm().item(), self.estimate.iterations)
+
+    @torch.no_grad()
+    def _misfit(
+        self, estimation: Estimation, records: list[SensorRecord], noise: Float[Tensor, " n_y"], weights: list[Tensor]
+    ) -> NormalEquations:
+        """The likelihood's equations for these weights, at the first states that suit them best."""
+        for held, value in zip(self.twin.closure.parameters(), weights, strict=True):
+            held.copy_(value)
+        return estimation.fit_initial_states(records, noise).normal_equations()
+
+    def report(self) -> dict[str, float]:
+        """RMS and standard errors, noise levels and biases of the last update, by name."""
+        if self.estimate is None:
+            return {}
+        errors = self.standard_errors(self._records)
+        found = {f"noise/{name}": value for name, value in self.estimate.noise.items()}
+        found |= {f"bias/{name}": self.estimate.biases[name] for name in self.config.biased}
+        return found | {f"standard_error/{name}": value for name, value in errors.items()} | super().report()
+
+    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """RMS error of what every sensor reads, in the records of the last update."""
+        if self.estimate is None:
+            return {}
+        signals = [sensor.measurement for sensor in self.sensors]
+        errors = judged(self.estimate.likelihood).rms.tolist()
+        return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
+
+    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """Standard errors of the last update."""
+        return {} if self.estimate is None else self.estimate.uncertainty.standard_errors()
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"begun": self.begun}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.begun = state["begun"]
+
+
+class FirstStates:
+    r"""What the first state of an episode is, given the states that sensors read in its first sample.
+
+    .. math:: \hat s = \bar s + C_{sy}C_{yy}^{-1}(y - \bar y)
+
+    Mean and covariance are those of the initial states that the plant draws. A state that always begins with the same
+    value, or follows from one that is read, is known.
+
+    Args:
+        plant: the plant.
+        sensors: the sensors.
+
+    Attributes:
+        spread: standard deviation of the first state about that guess; infinite for states that are read.
+    """
+
+    def __init__(self, plant: Plant, sensors: tuple[Sensor, ...]):
+        drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0))
+        own = state_places(plant, sensors)
+        self._columns = [column for column, k in enumerate(own) if k is not None]
+        self._read = [k for k in own if k is not None]
+        self._mean = drawn.mean(0)
+        centred = drawn - self._mean
+        self._gain = torch.linalg.pinv(centred[:, self._read]) @ centred
+        left = centred - centred[:, self._read] @ self._gain
+        scale = centred.abs().amax(0)
+        deviation = left.square().mean(0).sqrt()
+        self.spread = torch.where(deviation > 1e-9 * scale, deviation, 0.0)
+        self.spread[self._read] = torch.inf
+
+    def guess(self, record: SensorRecord) -> Float[Tensor, " n_s"]:
+        """The guess of a record's first state."""
+        first = record.readings[0, self._columns]
+        first = torch.where(first.isnan(), self._mean[self._read], first)
+        found = self._mean + (first - self._mean[self._read]) @ self._gain
+        found[self._read] = first
+        return found

@@ -69,8 +69,3 @@ class TwinningConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 < self.least_sound <= 1.0:
             raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")
-        if self.assimilation.drift and self.records > 1:
-            raise ValueError(
-                f"assimilation.drift={self.assimilation.drift} keeps what earlier episodes told, and would count them "
-                f"twice with records={self.records}; use 1."
-            )

@@ -6,17 +6,15 @@ from typing import Any
 
 import torch
 
+from rt_torchrl.fit.least_squares import SHORT
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.twinning.hypotheses.fit import Fit, misfit
-from rt_torchrl.twinning.hypotheses.turns import Turns
+from rt_torchrl.twinning.hypotheses.fit import Fit, Turns, misfit
 
-SEGMENTS = 60
-"""Number of segments of an episode by default."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 
@@ -45,13 +43,12 @@ class EnsembleAssimilation(Assimilation):
     ):
         super().__init__(twin, config)
         self.ensemble, self.hypotheses = twin, hypotheses
-        self.segment = hypotheses.segment or max(2, twin.plant.n_steps // SEGMENTS)
+        self.segment = hypotheses.segment or max(2, twin.plant.n_steps // SHORT)
         twin.risk = hypotheses.risk
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
         self.always, self.turns = always, Turns()
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call or set(twin.weights) != {ALONE}
-        self._records: Sequence[Trajectory] = ()
         self._before: float | None = None
 
     def update(
@@ -68,7 +65,6 @@ class EnsembleAssimilation(Assimilation):
         """
         self._before = self._believed_cost(records) if self.ensemble.hypothesis else None
         found = self._fit_alone(records, processes, count, generator)
-        self._records = records
         if self.called:
             self._weigh(generator)
         return found
@@ -83,7 +79,7 @@ class EnsembleAssimilation(Assimilation):
         """Fit the twin alone if that is due, or it is planned on; its gradient is not known where it rests."""
         if self.turns.due() or self.always or ALONE in self.ensemble.weights:
             return super().update(records, processes, count, generator)
-        cost = self.cost_of(batch_of(records))
+        self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
         return Descended(cost, cost, math.nan, 0)
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
@@ -116,10 +112,12 @@ class EnsembleAssimilation(Assimilation):
         self.ensemble.weights = counting(shares, self.hypotheses.least)
 
     def _misfit(self, fit: Fit, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        return fit.update(records, generator) if fit.turns.due() else misfit(fit.twin, records, self.segment)
+        if fit.turns.due():
+            return fit.update(records, generator, self.length)
+        return misfit(fit.twin, records, self.segment)
 
     def _believed_cost(self, records: Sequence[Trajectory]) -> float:
-        """J_p of the likeliest hypothesis, which is not the twin alone, over whole records."""
+        """J_p of the likeliest hypothesis, not the twin alone, over what it was fitted to."""
         return self.fits[self.ensemble.likeliest].cost(records)
 
     def report(self) -> dict[str, float | str]:
@@ -136,7 +134,17 @@ class EnsembleAssimilation(Assimilation):
             found["J_p_before"] = self._before
         if self.ensemble.hypothesis is not None and self._records:
             found |= {"J_p": self._believed_cost(self._records), "believed": self.ensemble.hypothesis}
-        return found
+        return found | super().report()
+
+    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """RMS errors of the likeliest hypothesis; see :meth:`Assimilation.rms_errors`."""
+        fit = self.fits.get(self.ensemble.likeliest)
+        return super().rms_errors(records) if fit is None else fit.whole.rms_errors(fit.rested(records))
+
+    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """Standard errors of the likeliest hypothesis; see :meth:`Assimilation.standard_errors`."""
+        fit = self.fits.get(self.ensemble.likeliest)
+        return super().standard_errors(records) if fit is None else fit.whole.standard_errors(fit.rested(records))
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {

@@ -10,11 +10,10 @@ from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, SensorAssimilation
 from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.sensor_assimilation import SensorAssimilation
 
 
 def make_twin(
