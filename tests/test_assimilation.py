@@ -21,9 +21,7 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 

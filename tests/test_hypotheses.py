@@ -28,8 +28,6 @@ from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.fit import AGAIN, FIRST, Reread, misfit, reread, with_hidden_states
-from rt_torchrl.steps.config import PlannerConfig
-from rt_torchrl.steps.plan import make_planner
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")

@@ -29,8 +29,8 @@ from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
