@@ -37,6 +37,8 @@ from .systems.safety_report import SafetyEvent, SafetyReport
 from .evaluation.baseline import RealController
 
 # Trajectories and the twin
+from .steps.config import LearnerConfig, LongTermMemoryConfig
+from .steps.learn import ActorCritic, Learner, LearningMethod
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
@@ -61,15 +63,6 @@ from .twinning.hypotheses.ensemble import TwinEnsemble
 from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
-from .twinning.learners import (
-    DDPG,
-    TD3,
-    ActorCritic,
-    Learner,
-    LearnerConfig,
-    LongTermMemoryConfig,
-    TD3Config,
-)
 from .twinning.planners import (
     ConstraintsConfig,
     Planner,
@@ -102,8 +95,6 @@ from .export import export_c, export_controller, export_onnx, export_program, ex
 __version__: str
 
 __all__ = [
-    "DDPG",
-    "TD3",
     "ActorCritic",
     "Actuation",
     "AssimilationConfig",
@@ -150,6 +141,7 @@ __all__ = [
     "LaggedCoefficients",
     "Learner",
     "LearnerConfig",
+    "LearningMethod",
     "LimitConfig",
     "Link",
     "LinkLostError",
@@ -211,7 +203,6 @@ __all__ = [
     "StackedObservations",
     "Start",
     "StateFeedback",
-    "TD3Config",
     "Trajectory",
     "Transition",
     "TwinEnsemble",

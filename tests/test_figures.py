@@ -18,12 +18,12 @@ from rt_torchrl.figures.policy import RESOLUTION, visited_observations
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 
 EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}

@@ -7,6 +7,7 @@ from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.reading import Actuation, Reading
 from rt_torchrl.systems.real_system import RealSystem
@@ -15,7 +16,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 
 RATE = 5.0

@@ -10,6 +10,7 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operation.acting import Crew
@@ -20,7 +21,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 
 QUIET = ExplorationConfig(episodes=0)

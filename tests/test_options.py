@@ -12,14 +12,13 @@ import pytest
 from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
+from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.safety import SafetyConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.referees import RefereeConfig
 

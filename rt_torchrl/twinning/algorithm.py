@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.steps.learn import ActorCritic, Learner
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operation import Operation, system_of
@@ -31,7 +32,6 @@ from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.operating import Operating
 from rt_torchrl.twinning.own_policies import require_own_policies
@@ -83,7 +83,7 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
+        self.learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, first_live(config.arm, first))
         require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rt_torchrl.options import check_options
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import RefereeConfig
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from rt_torchrl.steps.learn import Learner
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.learners import Learner
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 

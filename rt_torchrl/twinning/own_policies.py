@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from torch import nn
 
-from rt_torchrl.twinning.learners import Learner
+from rt_torchrl.steps.learn import Learner
 from rt_torchrl.twinning.planners import Planner
 from rt_torchrl.twinning.referees import Role
 

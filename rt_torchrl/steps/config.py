@@ -6,7 +6,7 @@ from typing import Literal
 
 from rt_torchrl.options import check_options, require_widths
 
-LearnerName = Literal["ddpg", "td3"]
+LearnerName = Literal["ddpg", "td3", "sac", "crossq", "redq"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,38 +37,16 @@ class LongTermMemoryConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3Config:
-    """Parameters of TD3 that DDPG does not have.
-
-    Args:
-        delay: number of critic iterations for each iteration of the policy and of the targets.
-        smoothing: standard deviation of the noise on the target's actions, as a share of half their range.
-        smoothing_limit: greatest noise on the target's actions, as a share of half their range.
-    """
-
-    delay: int = 2
-    smoothing: float = 0.2
-    smoothing_limit: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.delay < 1:
-            raise ValueError(f"delay={self.delay} of TD3 must be at least 1 critic iteration.")
-        for argument in ("smoothing", "smoothing_limit"):
-            if not 0.0 <= getattr(self, argument) <= 2.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of TD3 must lie in [0, 2] halves of the range.")
-
-
-@dataclass(frozen=True, kw_only=True)
 class LearnerConfig:
     """Parameters of step 2.
 
     Args:
-        algorithm: model-free method: ``ddpg``, as in the paper, or ``td3``, which takes the lower value of two critics,
-            delays the policy and smooths the targets.
+        algorithm: model-free method, a loss of TorchRL: ``ddpg``, as in the paper; ``td3``, which takes the lower value
+            of two critics, delays the policy and smooths the targets; or one that also prices the entropy of a policy
+            with noise: ``sac``, ``crossq`` (normalised layers instead of targets) or ``redq`` (more critics).
         critic_iterations: number n_Q of critic iterations per episode.
-        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every ``td3.delay``
-            critic iterations instead.
+        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every second critic
+            iteration instead, the others one for each.
         batch_size: number n_b of transitions in a batch; it is at most the number n_t of control intervals.
         discount: discount factor γ per control interval.
         return_steps: number of control intervals whose rewards a target sums before it bootstraps; 1 as in the paper.
@@ -76,16 +54,12 @@ class LearnerConfig:
             sum over more intervals mends that.
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
             scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
-        target_rate: rate τ at which the target critic, and TD3's target policy, follow.
+        target_rate: rate τ at which the targets follow.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
         gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
         critic_hidden: widths of the critic's hidden layers.
         memory: parameters of the long-term memory D_L.
-        td3: parameters of TD3 that DDPG does not have.
-        update: way to compute an update of DDPG: ``explicit`` for gradients by formula, several times as fast, or
-            ``torchrl`` for TorchRL's loss and autograd. Both give the same weights up to rounding. TD3, and critics or
-            losses of your own, always use TorchRL's way.
     """
 
     algorithm: LearnerName = "ddpg"
@@ -101,8 +75,6 @@ class LearnerConfig:
     gradient_limit: float = 1.0
     critic_hidden: Sequence[int] = field(default=(64, 64))
     memory: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
-    td3: TD3Config = field(default_factory=TD3Config)
-    update: Literal["explicit", "torchrl"] = "explicit"
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))
