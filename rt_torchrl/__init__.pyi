@@ -37,6 +37,8 @@ from .systems.safety_report import SafetyEvent, SafetyReport
 from .evaluation.unseen import RealController
 
 # Trajectories and the twin
+from .steps.config import LearnerConfig, LongTermMemoryConfig
+from .steps.learn import ActorCritic, Learner, LearningMethod
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
@@ -58,20 +60,9 @@ from .twinning.assimilation import AssimilationConfig
 from .twinning.hypotheses.config import HypothesesConfig
 from .twinning.hypotheses.ensemble import TwinEnsemble
 from .twinning.config import TwinningConfig
-from .steps.config import ExogenousConfig
-from .twinning.learners import (
-    DDPG,
-    TD3,
-    ActorCritic,
-    Learner,
-    LearnerConfig,
-    LongTermMemoryConfig,
-    TD3Config,
-)
-from .steps.config import ConstraintsConfig, PlannerConfig, ShortHorizonConfig
+from .steps.config import ConstraintsConfig, ExogenousConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
 from .steps.plan import Planner, RecedingHorizonPlanner, WholeEpisodes
 from .steps.short_horizon import ShortHorizon
-from .steps.config import RefereeConfig
 from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
@@ -95,8 +86,6 @@ from .export import export_c, export_controller, export_onnx, export_program, ex
 __version__: str
 
 __all__ = [
-    "DDPG",
-    "TD3",
     "ActorCritic",
     "Actuation",
     "AssimilationConfig",
@@ -142,6 +131,7 @@ __all__ = [
     "LaggedCoefficients",
     "Learner",
     "LearnerConfig",
+    "LearningMethod",
     "LimitConfig",
     "Link",
     "LinkLostError",
@@ -202,7 +192,6 @@ __all__ = [
     "StackedObservations",
     "Start",
     "StateFeedback",
-    "TD3Config",
     "Trajectory",
     "Transition",
     "TwinEnsemble",

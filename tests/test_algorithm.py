@@ -10,14 +10,13 @@ from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
+from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 
 STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "examine", "plan", "switch_policies"]
 
@@ -111,11 +110,11 @@ def test_what_is_stored_is_what_was_applied():
     found.interact()
     (record,) = found.short_term
     (commands,) = flown[-1]["action"]
-    stored = found.learner.memory._buffer[:60]
+    stored = found.learner.memory.buffer[:60]
     # The plant latches the applied action into the state at the end of the interval.
     # The flight computes it in machine code, and the record from the states of the flight: rounding.
     torch.testing.assert_close(record.actions, record.states[1:, 4:], rtol=1e-14, atol=0.0)
-    assert torch.equal(stored["action"], record.actions)
+    assert torch.equal(stored["action"], found.learner.actor.scaled(record.actions))
     assert (commands != record.actions).any(0).all()
     assert record.states.shape == (61, 6) and record.exogenous.shape == (60, 1)
 
@@ -145,7 +144,7 @@ def test_record_and_transitions_are_those_of_the_episode():
     for _ in range(3):
         report = found.interact()
     assert len(found.short_term) == 2 and len(found.learner.memory) == 60
-    record, last = found.short_term[-1], found.learner.memory._buffer[40:60]
+    record, last = found.short_term[-1], found.learner.memory.buffer[40:60]
     # On this plant the observation is the state.
     assert torch.equal(last["observation"], record.states[:-1])
     assert torch.equal(last["next", "observation"], record.states[1:])
@@ -180,7 +179,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
     for step in STEPS[:-1]:
         getattr(found, step)()
     optimisers = {
-        "model_free": lambda: found.learner.actor_optimiser.state,
+        "model_free": lambda: found.learner.actor_adam.steps[0].item(),
         "model_based": lambda: found.planner.descent._optimiser.state,
     }
     idle, before = found.referee.idle, weights(found.policies[live])

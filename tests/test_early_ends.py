@@ -32,12 +32,13 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.operated import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import LearnerConfig
+from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
 
 WEAK, STRONG = [[0.1, 0.1]], [[4.0, 2.5]]
 
@@ -139,8 +140,7 @@ def test_both_collectors_fly_the_same_episode_to_its_end():
 def test_sums_of_rewards_end_with_the_known_value_of_the_end():
     plant = Falling()
     config = LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, critic_hidden=(8,), batch_size=8)
-    learner = make_learner(plant, LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
-    assert isinstance(learner, DDPG)
+    learner = ActorCritic(plant, LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
     episode = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, LinearGain(WEAK)), plant).rollout()[0]
     found, n = learner.transitions(episode), len(episode)
     rewards = episode["next", "reward"].flatten().tolist()
@@ -153,7 +153,7 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
         assert found["next", "reward"][k].item() == pytest.approx(summed, rel=1e-9)
         assert found["next", "terminated"][k].item() == ends
         if ends:  # nothing is bootstrapped
-            q = learner.critic(found["observation"][k : k + 1], found["action"][k : k + 1]).item()
+            q = learner.values(found["observation"][k : k + 1], found["action"][k : k + 1]).item()
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
 
 

@@ -84,7 +84,7 @@ def test_the_sound_part_is_kept_and_the_training_goes_on(injection, kind, lost):
     assert reports[1][0][f"faults/{kind}"] == 1
     kept = N - len(lost)
     assert len(found.learner.memory) == N + kept and len(sound.learner.memory) == 2 * N
-    buffer, right = (one.learner.memory._buffer[:] for one in (found, sound))
+    buffer, right = (one.learner.memory.buffer[:] for one in (found, sound))
     assert torch.equal(buffer[: N + 8]["observation"], right[: N + 8]["observation"])
     assert all(value.abs().max() < 50.0 for value in buffer.select("observation", "action").values())
     record = found.short_term[-1]

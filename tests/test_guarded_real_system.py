@@ -7,7 +7,7 @@ from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.reading import Actuation, Reading
 from rt_torchrl.systems.real_system import RealSystem
@@ -16,7 +16,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 
 RATE = 5.0
 APPLIED = Reading(keys=("applied",), scale=2.0)

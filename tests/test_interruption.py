@@ -12,7 +12,7 @@ import pytest
 from small_runs import small_run
 
 from rt_torchrl.interruption import Interruption, require_finished, safe_point
-from rt_torchrl.twinning.learners import DDPG
+from rt_torchrl.steps.learn import ActorCritic
 
 EPISODES = 4
 QUICK = {"figures": False, "untrained": 0}
@@ -139,7 +139,7 @@ def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_
 def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
     """Step 2 iterates without an end here, and TorchRL has swapped weights for most of its time."""
     small = small_run(tmp_path, episodes=2, **QUICK)
-    run_one, update = small.algorithm.episode, DDPG.update
+    run_one, update = small.algorithm.episode, ActorCritic.update
 
     def endless(self):
         self.config = dataclasses.replace(self.config, critic_iterations=10**9)
@@ -147,7 +147,7 @@ def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
 
     def second(tell):
         if small.episodes:
-            monkeypatch.setattr(DDPG, "update", endless)
+            monkeypatch.setattr(ActorCritic, "update", endless)
             threading.Timer(0.5, press).start()
         return run_one(tell)
 

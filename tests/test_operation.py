@@ -10,7 +10,7 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operation.acting import Crew
@@ -21,7 +21,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
 
 QUIET = ExplorationConfig(episodes=0)
 NOISY = ExplorationConfig(episodes=3, spread=0.2)

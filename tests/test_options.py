@@ -12,13 +12,18 @@ import pytest
 from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
-from rt_torchrl.steps.config import ExogenousConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import (
+    ExogenousConfig,
+    LearnerConfig,
+    LongTermMemoryConfig,
+    PlannerConfig,
+    RefereeConfig,
+    ShortHorizonConfig,
+)
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.safety import SafetyConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -245,7 +245,7 @@ def test_a_critic_prices_the_end_of_a_window(name):
     weights = {k: v for k, v in algorithm.learner.loss.state_dict().items() if "target" not in k}
     prefix = next(k for k, v in weights.items() if k.endswith("0.weight") and v.shape[-1] == 3)
     found = []
-    for number in range(len(algorithm.learner.critics)):
+    for number in range(algorithm.learner.method.critics):
         x = torch.cat([seen, actions / 2.0], -1)  # the range of the action is ±2 N
         for layer in (0, 2):
             weight, bias = (weights[prefix.replace("0.weight", f"{layer}.{part}")] for part in ("weight", "bias"))

@@ -3,6 +3,7 @@
 import copy
 import io
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,15 +12,14 @@ from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
 from test_algorithm import twinning, weights
 
-from rt_torchrl.steps.config import PlannerConfig, RefereeConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
+from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
 from rt_torchrl.steps.plan import Planner, WholeEpisodes
 from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.learners import DDPG, TD3, Learner, LearnerConfig
-from rt_torchrl.twinning.learners.config import TD3Config
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)
@@ -28,15 +28,19 @@ SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16, "criti
 
 def documented(page, name):
     """The class of this name from the code on a page of the documentation."""
-    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+    codes = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+    (code,) = [code for code in codes if f"class {name}" in code]
     scope = {}
     exec(code, scope)
     return scope[name]
 
 
+def actor_critic(algorithm, policy):
+    return ActorCritic(PLANT, policy, LearnerConfig(algorithm=algorithm, **SMALL), generator=seeded(1))
+
+
 LEARNERS = {
-    "ddpg": lambda policy: DDPG(PLANT, policy, LearnerConfig(**SMALL), generator=seeded(1)),
-    "td3": lambda policy: TD3(PLANT, policy, LearnerConfig(**SMALL, td3=TD3Config(delay=2)), generator=seeded(1)),
+    **{name: partial(actor_critic, name) for name in METHODS},
     "documented": lambda policy: documented("learner.md", "RandomSearch")(policy, generator=seeded(1)),
 }
 PLANNERS = {
@@ -116,7 +120,7 @@ def test_planners_improve_their_policy_on_what_they_are_given(name):
 
 def test_a_learner_of_another_policy_is_refused():
     other = PLANT.make_policy(seeded(5))
-    with pytest.raises(ValueError, match="DDPG trains another policy than model_free"):
+    with pytest.raises(ValueError, match="ActorCritic trains another policy than model_free"):
         algorithm(learner=lambda policy: LEARNERS["ddpg"](other))
     with pytest.raises(ValueError, match="WholeEpisodes trains another policy than model_based"):
         algorithm(planner=lambda twin, policy: PLANNERS["whole episodes"](twin, other))
@@ -127,7 +131,7 @@ def test_configuration_names_the_parts():
     short = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10))
     found = twinning(PLANT, **parts, planner=short)
     kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
-    assert kinds == ["TD3", "ShortHorizon", "ExpectedCost"]
+    assert kinds == ["ActorCritic", "ShortHorizon", "ExpectedCost"]
     report = found.episode()
     assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
 

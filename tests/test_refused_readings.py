@@ -33,7 +33,7 @@ class Spiky(Failing):
 
 def stored(found):
     """Everything that both memories hold, in one vector."""
-    record, replay = found.short_term[-1], found.learner.memory._buffer[:]
+    record, replay = found.short_term[-1], found.learner.memory.buffer[:]
     entries = [replay[key] for key in ("observation", "action", ("next", "observation"), ("next", "reward"))]
     return torch.cat([tensor.flatten() for tensor in (*entries, record.states, record.actions, record.exogenous)])
 

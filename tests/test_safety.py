@@ -204,7 +204,7 @@ def test_reinforcement_twinning_learns_from_what_was_applied():
     held = {event.step: event.applied for event in env.report.events}
     for k, value in held.items():
         assert record.actions[k].tolist() == value
-    assert torch.equal(found.learner.memory._buffer[:]["action"], record.actions)
+    assert torch.equal(found.learner.memory.buffer[:]["action"], found.learner.actor.scaled(record.actions))
 
 
 def test_specs_hold_around_both_kinds_of_systems():

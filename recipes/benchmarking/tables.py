@@ -51,7 +51,7 @@ def training_table(trainings: Mapping[str, Sequence[float]]) -> str:
 
 
 def update_table(updates: Mapping[str, Mapping[str, float]]) -> str:
-    """CPU milliseconds of an iteration of critic and policy, by formula and by TorchRL's losses."""
+    """CPU milliseconds of an iteration of critic and policy, traced and as TorchRL makes it."""
     ways = list(dict.fromkeys(way for found in updates.values() for way in found))
     lines = [f"{'CPU ms per iteration, step 2':<31} " + " ".join(f"{way:>10}" for way in ways)]
     lines += [f"{plant:<31} " + " ".join(f"{found[way]:10.3f}" for way in ways) for plant, found in updates.items()]

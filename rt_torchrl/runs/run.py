@@ -40,6 +40,7 @@ from rt_torchrl.runs.run_start import start_of, twin_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import of_each_role
+from rt_torchrl.steps.learn import ActorCritic, MakeLearner
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -63,6 +64,8 @@ class Run:
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure and ``config.real_unseen`` flights, a :class:`RealController`.
         first: class of the controller that the real system has had so far, for ``start="controller"``.
+        learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
+            step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
         callbacks: functions that see the entries of all episodes after each one, and may end the training; see
             :data:`Callback`.
         animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
@@ -85,6 +88,7 @@ class Run:
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
+        learner: MakeLearner = ActorCritic,
         callbacks: Sequence[Callback] = (),
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
@@ -110,7 +114,7 @@ class Run:
             if real is None:
                 make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
             system = real or simulated(plant, config, first, device=device, compiled=compiled)
-            self._make_algorithm(system, make_env, physics, device=device, compiled=compiled)
+            self._make_algorithm(system, make_env, physics, learner, device=device, compiled=compiled)
             self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
             self._real, self._first, self._device = real, first, device
             made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
@@ -129,6 +133,7 @@ class Run:
         env: EnvBase,
         make_env: Callable[[], EnvBase] | None,
         physics: Plant,
+        make_learner: MakeLearner,
         *,
         device: torch.device,
         compiled: bool,
@@ -141,6 +146,7 @@ class Run:
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
         acting = acting_by_name(policies, first)
+        learner = make_learner(physics, policies["model_free"], config.twinning.learner, generator=generator)
         self.algorithm = ReinforcementTwinning(
             operation_of(config, env, make_env, physics, acting, folder=self.folder) if config.asynchronous else env,
             twin_of(config, physics, closure, first, compiled=compiled),
@@ -148,6 +154,7 @@ class Run:
             model_based=policies["model_based"],
             config=config.twinning,
             generator=generator,
+            learner=learner,
             first=first,
             make_policy=self.make_policy,
         )

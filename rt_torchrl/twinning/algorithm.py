@@ -20,6 +20,7 @@ from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.learn import ActorCritic, Learner
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
 from rt_torchrl.steps.switch import Evidence, Referee, make_referee
 from rt_torchrl.systems.collectors import collector_of
@@ -34,7 +35,6 @@ from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
-from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.operating import Operating
 from rt_torchrl.twinning.saved_state import load_parts, on_device
@@ -79,7 +79,7 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
+        self.learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, first_live(config.arm, first))
         for role, part in (("model_free", self.learner), ("model_based", self.planner)):

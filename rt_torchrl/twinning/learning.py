@@ -10,9 +10,9 @@ from tensordict import TensorDict
 
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.learn import Learner
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.learners import Learner
 
 
 class Learning:

@@ -1,0 +1,752 @@
+r"""Step 2: a policy that climbs the value which critics learn from prioritised replay, by any loss of TorchRL.
+
+.. math::
+    y_k = \sum_{j<m}\gamma^jr_{k+j} + \gamma^m\,q'(e_{k+m}, \pi(e_{k+m})), \qquad \delta_k = y_k - q(e_k, a_k)
+
+One iteration (loss, gradients, optimiser, targets) is traced once and replayed as a flat graph: the numbers of TorchRL
+to the bit, without the time that it takes to find out what to compute.
+"""
+
+import contextlib
+import copy
+import functools
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.optim.adam import adam
+from torch.utils._pytree import tree_flatten
+from torchrl.data import Bounded, LazyTensorStorage, MultiStep, TensorDictPrioritizedReplayBuffer, Writer
+from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, SoftUpdate, TD3Loss
+
+from rt_torchrl.interruption import safe_point
+from rt_torchrl.optimisers.norm import norm_of
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import mlp
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
+from rt_torchrl.systems.refusal import finite_errors, finite_transitions
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """A model-free method, which keeps parts of every real episode and improves π_mf from them.
+
+    ``docs/learner.md`` shows how to write one.
+    """
+
+    policy: nn.Module
+    """Policy π_mf, updated in place."""
+
+    def store(self, episode: TensorDictBase) -> None:
+        """Keep the parts of a real episode that the learner needs, whichever policy flew the episode (step 1).
+
+        Args:
+            episode: ``observation``, ``action`` (as applied) and ``("next", ...)`` of n_t control intervals.
+        """
+
+    def update(self) -> TensorDict:
+        """Improve the policy (step 2).
+
+        Returns:
+            Scalars for the report of the episode, by name; there may be none.
+        """
+
+    def restart(self) -> None:
+        """Forget everything that belongs to the policy's earlier weights, because the policy's weights have jumped."""
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Observations on the real system, from which a clone of another architecture learns."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update depends on, except the policy's weights: tensors in plain containers."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the :meth:`state_dict` of a learner with the same configuration."""
+
+
+class LearningMethod(NamedTuple):
+    """A model-free method: the loss, and what it needs.
+
+    Attributes:
+        make_loss: function of actor and critics, in the form that TorchRL's losses take, that makes the loss. Actions
+            are scaled to [−1, 1].
+        critics: number of critics.
+        stochastic: whether the actor is a distribution around π_mf, whose spread is learned, too.
+        delay: number of critic iterations for each iteration of policy and targets; 0 makes all iterations of the
+            critic first, each with one of its target, and then those of the policy, as the paper does.
+        squared: whether the loss reports δ² as ``td_error``, and not |δ|.
+        normalised: whether the layers of the critics are normalised over a batch.
+    """
+
+    make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
+    critics: int = 1
+    stochastic: bool = False
+    delay: int = 1
+    squared: bool = True
+    normalised: bool = False
+
+
+def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
+    """DDPG, the paper's method (section 4.1)."""
+    return DDPGLoss(actor, critics[0], loss_function="l2", delay_value=True)
+
+
+def td3_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
+    """TD3: the lower of two values at smoothed target actions (Fujimoto, van Hoof, Meger, ICML 2018)."""
+    return TD3Loss(actor, critics, bounds=(-1.0, 1.0), num_qvalue_nets=len(critics), loss_function="l2")
+
+
+def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]:
+    """A loss that prices the entropy of scaled actions: SAC, CrossQ or REDQ."""
+
+    def make(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
+        n_a = cast(ProbabilisticActor, actor).spec["action"].shape[-1]
+        options = {"num_qvalue_nets": len(critics), "loss_function": "l2", "target_entropy": -float(n_a)}
+        return loss(actor, critics, alpha_init=0.1, **options)
+
+    return make
+
+
+METHODS: dict[str, LearningMethod] = {
+    "ddpg": LearningMethod(ddpg_loss, delay=0),
+    "td3": LearningMethod(td3_loss, critics=2, delay=2),
+    "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
+    "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
+    "redq": LearningMethod(entropic(REDQLoss), critics=4, stochastic=True),
+}
+"""The methods that a configuration can name."""
+
+
+class Critic(nn.Module):
+    """The value q(e, a): a perceptron of the observation and of the action scaled to [−1, 1].
+
+    Args:
+        widths: numbers of inputs and of units of each hidden layer.
+        normalised: whether the inputs of each layer are normalised over a batch.
+        generator: source of the initial weights.
+    """
+
+    def __init__(self, widths: Sequence[int], *, normalised: bool = False, generator: torch.Generator):
+        super().__init__()
+        self.network = mlp(widths[0], widths[1:], 1, generator=generator, activation=nn.SiLU)
+        if normalised:
+            layers, device = list(self.network), generator.device
+            norms = iter([BatchRenorm1d(width).to(device, torch.float64) for width in widths])
+            parts = [[next(norms), layer] if isinstance(layer, nn.Linear) else [layer] for layer in layers]
+            self.network = nn.Sequential(*(part for group in parts for part in group))
+
+    def forward(
+        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch 1"]:
+        return self.network(torch.cat([observation, action], -1))
+
+
+class ScaledPolicy(nn.Module):
+    """A policy with its actions scaled to [−1, 1] or, as a distribution, location and spread before the tanh.
+
+    Args:
+        plant: plant that gives the ranges of the actions.
+        policy: the policy.
+        stochastic: whether it is a distribution around the policy.
+        device: device of the ranges.
+    """
+
+    middle: Tensor
+    half_range: Tensor
+    LEAST, GREATEST = -5.0, 1.0
+    """Bounds on the logarithm of the spread."""
+    EDGE = 1.0 - 1e-6
+    """Greatest scaled action whose location is finite enough."""
+
+    def __init__(self, plant: Plant, policy: nn.Module, *, stochastic: bool, device: torch.device):
+        super().__init__()
+        low, high = bounds(plant.actions, device=device)
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.policy = policy
+        self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
+        with torch.no_grad():
+            self.log_spread.weight.zero_()
+            self.log_spread.bias.fill_(-1.0)
+        if not stochastic:
+            del self.log_spread
+
+    def scaled(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
+        """Actions from their range to [−1, 1]."""
+        return (action - self.middle) / self.half_range
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Tensor | tuple[Tensor, Tensor]:
+        share = self.scaled(self.policy(observation))
+        if not hasattr(self, "log_spread"):
+            return share
+        spread = self.log_spread(observation).clamp(self.LEAST, self.GREATEST).exp()
+        return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
+
+
+TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
+Key = str | tuple[str, ...]
+BATCH: tuple[Key, ...] = (*TRANSITION, "priority_weight", "steps_to_next_obs")
+"""What a loss reads of a batch, where it is there."""
+AT_ONCE = 50
+"""Number of batches drawn in one call, between which priorities rest: a draw takes as long as half an iteration."""
+
+
+class ActorCritic:
+    """A policy that learns by a loss of TorchRL and prioritised replay (paper, section 4.1).
+
+    Args:
+        plant: plant that gives the number of observations and the ranges of the actions.
+        policy: policy π_mf, updated in place.
+        config: parameters of step 2.
+        generator: source of the critics' initial weights and of the samples.
+        method: the method, for a loss of one's own; by default the one that ``config.algorithm`` names.
+
+    Raises:
+        ValueError: if ``return_steps`` exceeds an episode of the plant.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        policy: nn.Module,
+        config: LearnerConfig,
+        *,
+        generator: torch.Generator,
+        method: LearningMethod | None = None,
+    ):
+        if config.return_steps > plant.n_steps:
+            raise ValueError(
+                f"return_steps={config.return_steps} exceeds the {plant.n_steps} control intervals of an episode of "
+                f"plant {plant.name!r}; use at most a tenth of them, or a longer horizon."
+            )
+        self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
+        self.method = method or METHODS[config.algorithm]
+        self.batch_size = min(config.batch_size, plant.n_steps)
+        self.memory = LongTermMemory(config.memory, generator=generator)
+        stochastic, n_a = self.method.stochastic, len(plant.actions)
+        self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
+        widths = (len(plant.observations) + n_a, *config.critic_hidden)
+        critics = [
+            ValueOperator(
+                Critic(widths, normalised=self.method.normalised, generator=generator),
+                in_keys=["observation", "action"],
+            )
+            for _ in range(self.method.critics)
+        ]
+        module = TensorDictModule(self.actor, ["observation"], ["loc", "scale"] if stochastic else ["action"])
+        spec = Bounded(-1.0, 1.0, (n_a,), dtype=torch.float64, device=generator.device)
+        distribution = {"in_keys": ["loc", "scale"], "distribution_class": TanhNormal, "return_log_prob": True}
+        self.loss = self.method.make_loss(
+            ProbabilisticActor(module, spec=spec, **distribution) if stochastic else module, critics
+        )
+        self.loss.make_value_estimator(gamma=config.discount)
+        targets = any(name.startswith("target_") for name, _ in self.loss.named_buffers())
+        self.target = SoftUpdate(self.loss, tau=config.target_rate) if targets else None
+        named = [(name, w) for name, w in self.loss.named_parameters() if w.requires_grad]
+        self.critic_adam = Adam([w for name, w in named if "value_network" in name], config.critic_rate)
+        self.actor_adam = Adam([w for name, w in named if "value_network" not in name], config.actor_rate)
+        self._returns = MultiStep(config.discount, config.return_steps)
+        self._iterations: dict[tuple[Any, ...], Iteration] = {}
+
+    @property
+    def shortest(self) -> int:
+        """Least number of control intervals in a row that can be stored."""
+        return self.config.return_steps
+
+    def store(self, episode: TensorDictBase) -> None:
+        """Keep the transitions of a real episode, with their TD errors as priorities.
+
+        Raises:
+            ValueError: if a number of the episode is not finite, or a TD error, because the critic has diverged.
+        """
+        transitions = self.transitions(finite_transitions(episode.select(*TRANSITION)))
+        self.memory.store(transitions, finite_errors(self.td_errors(transitions)))
+
+    def transitions(self, episode: TensorDictBase) -> TensorDictBase:
+        """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
+
+        Actions are scaled to [−1, 1]. The last m − 1 intervals are left out. With shorter sums there, the values of the
+        observations at the end of episodes, such as a target that is reached, would depend on hardly anything but
+        themselves and drift without bound. Where an episode ends early they stay: their sums end with the value of its
+        end, which is known.
+        """
+        over = self._end_cost is not None and bool(episode["next", "terminated"][-1].any())
+        whole = len(episode) if over else len(episode) - self.config.return_steps + 1
+        transitions = episode.select(*TRANSITION).clone()
+        transitions["action"] = self.actor.scaled(transitions["action"])
+        if over:
+            transitions["next", "reward"][-1] += self.end_value()
+        transitions["next", "reward"] = self.config.reward_scale * transitions["next", "reward"]
+        returns = self._returns(transitions.unsqueeze(0))[0, :whole]
+        if over:  # TorchRL moves all that is next, but not what says whether it is an end
+            last = torch.arange(whole, device=returns.device) + returns["steps_to_next_obs"].flatten() == whole
+            returns["next", "terminated"] = last.unsqueeze(-1)
+        return returns.select(*BATCH, strict=False)
+
+    def end_value(self) -> float:
+        r"""What comes after the last reward of an episode that ends early, :math:`-\gamma L_e/(1 - \gamma)`."""
+        discount = self.config.discount
+        return -discount * (self._end_cost or 0.0) / (1.0 - discount)
+
+    @torch.no_grad()
+    def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
+        """TD errors |δ| of transitions with the present critics and target critics."""
+        batch = transitions.copy()
+        with self._drawing():
+            self.loss(batch)
+        return self.sizes(batch["td_error"])
+
+    def sizes(self, td_error: Tensor) -> Float[Tensor, " n"]:
+        """|δ| of each transition, from what the loss reports."""
+        return (td_error.sqrt() if self.method.squared else td_error).flatten()
+
+    @contextlib.contextmanager
+    def _drawing(self) -> Iterator[None]:
+        """TorchRL's losses draw from the global generator, which the learner's own generator seeds here."""
+        device = self.generator.device
+        seed = torch.randint(2**31, (), generator=self.generator, device=device)
+        with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
+            torch.manual_seed(seed.item())
+            yield
+
+    def update(self) -> TensorDict:
+        """Make the iterations of an update, and take them back if they end with numbers that are not finite.
+
+        Such weights would stay so for good, and with them all that is learned later. The iterations run on one thread
+        of torch: on several, each of their small operations waits for all threads.
+
+        Returns:
+            Means of ``critic_loss``, ``td_error``, ``value`` and both gradient norms over the iterations; the first
+            three are for the rewards without ``reward_scale``. Of an update that is taken back, the ``reason`` instead.
+        """
+        parts = {name: getattr(self, name) for name in UPDATED}
+        before = copy.deepcopy({name: part.state_dict() for name, part in parts.items()})
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            with self._drawing():
+                report = self._iterate()
+            broken = [name for name, part in parts.items() if not finite(part.state_dict())]
+            if not broken:
+                return report
+            reason = f"numbers of {' and '.join(broken)} are not finite"
+        except FloatingPointError as error:
+            reason = str(error)
+        finally:
+            torch.set_num_threads(threads)
+        for name, part in parts.items():
+            part.load_state_dict(before[name])
+        said = f"update of model_free taken back: {reason}; use smaller learning rates or reward_scale"
+        return TensorDict().set_non_tensor("reason", said)
+
+    def _iterate(self) -> TensorDict:
+        config, delay = self.config, self.method.delay
+        found: dict[str, list[Tensor]] = {}
+        phases = [("critic", config.critic_iterations)] + ([] if delay else [("actor", config.actor_iterations)])
+        for kind, count in phases:
+            for first in range(0, count, AT_ONCE):
+                drawn = self.memory.sample(min(AT_ONCE, count - first) * self.batch_size).to(self.generator.device)
+                keys = [key for key in BATCH if key in drawn.keys(include_nested=True)]
+                errors = list[Tensor]()
+                for k, batch in enumerate(zip(*(drawn[key].split(self.batch_size) for key in keys), strict=True)):
+                    safe_point()
+                    iteration = self.iteration("both" if delay and (first + k + 1) % delay == 0 else kind, keys)
+                    results = dict(zip(iteration.names, iteration(batch), strict=True))
+                    errors += [results.pop("errors")] if "errors" in results else []
+                    for name, value in results.items():
+                        found.setdefault(name, []).append(value)
+                if errors:
+                    sizes = torch.stack(errors)
+                    unsound = ~sizes.isfinite().all(-1)
+                    if unsound.any():
+                        where = first + 1 + int(unsound.int().argmax())
+                        raise FloatingPointError(f"a target or value of critic iteration {where} is not finite")
+                    self.memory.refresh(drawn["index"], sizes.flatten())
+        scale = config.reward_scale
+        return TensorDict({name: torch.stack(v).mean() / scale ** POWERS[name] for name, v in found.items()})
+
+    def iteration(self, kind: str, keys: Sequence[Key]) -> "Iteration":
+        """One iteration of the ``critic``, of the ``actor`` or of ``both``, traced when it is first asked for."""
+        name = (kind, *keys)
+        if name not in self._iterations:
+            self._iterations[name] = Iteration(self, kind, keys)
+        return self._iterations[name]
+
+    def cost_to_go(self, observation: Float[Tensor, "n n_o"]) -> Float[Tensor, " n"]:
+        r"""What the policy costs from observations on, :math:`-q(e, \pi(e))` for the rewards without their scale.
+
+        With several critics it is that of the lowest value, as in the targets. It is differentiable by the observation.
+        """
+        values = self.values(observation, self.actor.scaled(self.policy(observation)))
+        return -values.amin(0).squeeze(-1) / self.config.reward_scale
+
+    def values(
+        self, observation: Float[Tensor, "n n_o"], action: Float[Tensor, "n n_a"], *, target: bool = False
+    ) -> Float[Tensor, "critics n 1"]:
+        """The values of all critics, or of their targets, for scaled actions."""
+        pairs = TensorDict({"observation": observation, "action": action}, batch_size=len(observation))
+        name = "qvalue_network" if hasattr(self.loss, "qvalue_network_params") else "value_network"
+        network, weights = getattr(self.loss, name), getattr(self.loss, f"{'target_' * target}{name}_params")
+        values = list[Tensor]()
+        network.eval()
+        for of_one in weights.unbind(0) if weights.batch_size else [weights]:
+            with of_one.to_module(network):
+                values.append(network(pairs.copy())["state_action_value"])
+        network.train()
+        return torch.stack(values)
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """See :meth:`Learner.observations`."""
+        return self.memory.observations().to(self.generator.device)
+
+    def restart(self) -> None:
+        """Forget the state of the policy's optimiser, because its weights have jumped."""
+        self.actor_adam.restart()
+
+    def state_dict(self) -> dict[str, Any]:
+        """See :meth:`Learner.state_dict`."""
+        parts = {name: getattr(self, name).state_dict() for name in COMPONENTS}
+        return parts | {"generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See :meth:`Learner.load_state_dict`."""
+        for name in COMPONENTS:
+            getattr(self, name).load_state_dict(state[name])
+        self.generator.set_state(state["generator"].cpu())
+
+
+POWERS = {"critic_loss": 2, "td_error": 1, "critic_gradient": 0, "value": 1, "actor_gradient": 0}
+"""What a report holds, and the power of the rewards' scale in it that the report leaves out."""
+UPDATED = ("policy", "loss", "critic_adam", "actor_adam")
+COMPONENTS = ("loss", "critic_adam", "actor_adam", "memory")
+
+
+def finite(state: Mapping[str, Any]) -> bool:
+    """Whether all numbers of a state are finite."""
+    tensors = (part for part in tree_flatten(dict(state))[0] if isinstance(part, Tensor))
+    return all(bool(part.isfinite().all()) for part in tensors)
+
+
+class Adam:
+    """Adam by torch's fused kernel, with moments that stay where they are, so that a traced graph may hold them.
+
+    Args:
+        weights: weights that it trains.
+        rate: learning rate.
+    """
+
+    def __init__(self, weights: list[nn.Parameter], rate: float):
+        self.weights, self.rate = weights, rate
+        self.moments = [[torch.zeros_like(w, requires_grad=False) for w in weights] for _ in range(2)]
+        self.steps = [torch.zeros((), dtype=torch.float32, device=w.device) for w in weights]
+
+    @torch.no_grad()
+    def step(self, gradients: list[Tensor]) -> None:
+        """Change the weights by their gradients."""
+        adam(
+            cast(list[Tensor], self.weights),
+            gradients,
+            *self.moments,
+            max_exp_avg_sqs=[],
+            state_steps=self.steps,
+            fused=True,
+            amsgrad=False,
+            lr=self.rate,
+            beta1=0.9,
+            beta2=0.999,
+            eps=1e-8,
+            weight_decay=0.0,
+            maximize=False,
+        )
+
+    def restart(self) -> None:
+        """Forget all steps."""
+        for part in self.parts():
+            part.zero_()
+
+    def parts(self) -> list[Tensor]:
+        """All tensors of its state."""
+        return [*self.moments[0], *self.moments[1], *self.steps]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"parts": [part.clone() for part in self.parts()]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for part, saved in zip(self.parts(), state["parts"], strict=True):
+            part.copy_(saved)
+
+
+class Iteration:
+    """One iteration: loss, gradients, steps of the optimisers and of the targets, as a flat graph.
+
+    The graph holds weights, moments and targets by reference; a batch is its input. What a policy has beside its
+    weights and buffers, such as numbers in attributes, is read once, when the graph is made.
+
+    Args:
+        learner: learner whose weights change.
+        kind: ``critic``, ``actor`` or ``both``.
+        keys: what the batches hold.
+    """
+
+    def __init__(self, learner: ActorCritic, kind: str, keys: Sequence[Key]):
+        self.learner, self.keys = learner, list(keys)
+        self.critic, self.actor = kind != "actor", kind != "critic"
+        self.target = learner.target if kind == "both" or (learner.method.delay == 0 and self.critic) else None
+        names = ("critic_loss", "errors", "td_error", "critic_gradient") if self.critic else ()
+        self.names = (*names, "value", "actor_gradient") if self.actor else names
+        self._graph: Callable[..., Sequence[Tensor]] | None = None
+
+    @torch.no_grad()
+    def __call__(self, batch: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Make the iteration.
+
+        Args:
+            batch: tensors of a batch, in the order of the keys.
+
+        Returns:
+            What ``names`` names.
+        """
+        if self._graph is None:
+            self._graph = self._traced(batch)
+        return self._graph(*batch)
+
+    @torch.enable_grad()
+    def eager(self, *batch: Tensor) -> list[Tensor]:
+        """The iteration as TorchRL and torch make it."""
+        learner = self.learner
+        transitions = TensorDict(dict(zip(self.keys, batch, strict=True)), batch_size=[len(batch[0])])
+        losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
+        results = list[Tensor]()
+        steps = list[tuple[Adam, list[Tensor]]]()
+        if self.critic:
+            loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
+            gradients = slopes(loss, learner.critic_adam.weights)
+            errors = learner.sizes(transitions["td_error"].detach())
+            results += [loss.detach(), errors, errors.mean(), norm_of(gradients)]
+            steps.append((learner.critic_adam, gradients))
+        if self.actor:
+            loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
+            gradients = slopes(loss, learner.actor_adam.weights)
+            norm = norm_of(gradients)
+            share = (learner.config.gradient_limit / (norm + TINY)).clamp(max=1.0)
+            results += [-losses["loss_actor"].detach(), norm]
+            steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
+        for optimiser, gradients in steps:
+            optimiser.step(gradients)
+        if self.target is not None:
+            self.target.step()
+        return results
+
+    def _traced(self, batch: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
+        """The iteration as a flat graph, or as it is where it cannot be traced; nothing is changed."""
+        learner = self.learner
+        state = [*learner.loss.parameters(), *learner.loss.buffers()]
+        state += [*learner.critic_adam.parts(), *learner.actor_adam.parts()]
+        before = [part.detach().clone() for part in state]
+        device = learner.generator.device
+        try:
+            with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
+                return flat(make_fx(self.eager)(*batch))
+        except RuntimeError as error:
+            policy = type(learner.policy).__name__
+            warnings.warn(f"Step 2 is slower, because {policy} cannot be traced: {error}", stacklevel=4)
+            return self.eager
+        finally:
+            for part, saved in zip(state, before, strict=True):
+                part.copy_(saved)
+
+
+TINY = 1e-6
+"""Number that ``torch.nn.utils.clip_grad_norm_`` adds to a norm."""
+
+
+def slopes(loss: Tensor, weights: list[nn.Parameter]) -> list[Tensor]:
+    """The gradient of a loss by each of some weights; zero where the loss does not depend on one."""
+    return list(torch.autograd.grad(loss, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
+
+
+aten = torch.ops.aten
+PASSED = (aten.detach.default, aten.alias.default)
+"""What changes nothing where no gradients are asked for."""
+
+
+def flat(module: GraphModule) -> Callable[..., Sequence[Tensor]]:
+    """The function of a traced module, without what changes nothing and what nobody reads.
+
+    Weights and other tensors that the module holds become arguments, because each access to them costs as much as a
+    small operation; their transposes are taken once, since these are views of the same numbers.
+    """
+    graph, held = module.graph, dict[str, Tensor]()
+    for node in graph.nodes:
+        (source, *_) = node.all_input_nodes or (None,)
+        if node.op == "get_attr":
+            held[node.target] = getattr(module, node.target).detach()
+        elif node.target in PASSED:
+            node.replace_all_uses_with(source)
+        elif node.target is aten.t.default and source.op == "get_attr":
+            name = f"{source.target}_t"
+            held[name] = held[source.target].t()
+            setattr(module, name, held[name])
+            node.op, node.target, node.args = "get_attr", name, ()
+        elif node.target is aten.t.default and source.target is aten.t.default:
+            node.replace_all_uses_with(source.args[0])
+    graph.eliminate_dead_code()
+    readers = [node for node in graph.nodes if node.op == "get_attr"]
+    names = sorted({node.target for node in readers})
+    with graph.inserting_before(next(iter(graph.nodes))):
+        arguments = {name: graph.placeholder(f"held_{name}") for name in names}
+    for node in readers:
+        node.replace_all_uses_with(arguments[node.target])
+        graph.erase_node(node)
+    return functools.partial(GraphModule(nn.Module(), graph).forward, *(held[name] for name in names))
+
+
+class LongTermMemory:
+    r"""The memory D_L, which samples transitions by priority.
+
+    .. math:: P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}
+
+    When it is full, new transitions replace those with the least probability of being sampled (paper, section 4.3).
+    It stands on the CPU.
+
+    Args:
+        config: parameters of D_L.
+        generator: source of the samples.
+    """
+
+    def __init__(self, config: LongTermMemoryConfig, *, generator: torch.Generator):
+        self._config, self._generator = config, generator
+        if generator.device.type != "cpu":
+            seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+            self._generator = torch.Generator(device="cpu").manual_seed(int(seed))
+        self._clear()
+
+    def _clear(self) -> None:
+        config = self._config
+        self._writer = LeastPriorityWriter(config.capacity)
+        # It takes priorities as they are, because a power is rounded by the place of its number in the memory, and a
+        # training that goes on from a saved state has to sample the same.
+        self.buffer = TensorDictPrioritizedReplayBuffer(
+            alpha=1.0,
+            beta=config.correction,
+            eps=0.0,
+            storage=LazyTensorStorage(config.capacity, device="cpu"),
+            sampler_device="cpu",
+        )
+        self.buffer.set_writer(self._writer)
+        self.buffer.set_rng(self._generator)
+
+    def __len__(self) -> int:
+        return len(self.buffer)
+
+    def store(self, transitions: TensorDictBase, td_errors: Float[Tensor, " n"]) -> None:
+        """Add transitions, a TensorDict of batch size n, with their TD errors δ."""
+        index = self.buffer.extend(transitions.cpu())
+        self.refresh(index, td_errors)
+
+    def sample(self, count: int) -> TensorDictBase:
+        """Draw transitions, with their ``index`` (for :meth:`refresh`) and importance weight ``priority_weight``."""
+        return self.buffer.sample(count)
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Observations of all transitions, in no particular order."""
+        return self.buffer[:]["observation"]
+
+    def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
+        """Give sampled transitions their new TD errors δ; of several for one transition the last one counts.
+
+        Raises:
+            FloatingPointError: if one is not finite in single precision; none is then given.
+        """
+        errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
+        if not errors.isfinite().all():
+            raise FloatingPointError("a TD error exceeds the range of single precision")
+        self._prioritise(index.cpu(), (errors + self._config.offset) ** self._config.prioritisation)
+
+    def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
+        self._writer.priorities[index.numpy()] = priorities.numpy()
+        self.buffer.update_tensordict_priority(TensorDict({"index": index, "td_error": priorities}, [len(index)]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The transitions in their places with their priorities."""
+        count = len(self)
+        if not count:
+            return {"count": 0}
+        stored = self.buffer[:].flatten_keys(".").to_dict()
+        priorities = torch.from_numpy(self._writer.priorities[:count].copy())
+        generator = self._generator.get_state()
+        return {"count": count, "transitions": stored, "priorities": priorities, "generator": generator}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._clear()
+        if count := state["count"]:
+            transitions = TensorDict(state["transitions"], batch_size=[count], device="cpu")
+            index = self.buffer.extend(transitions.unflatten_keys("."))
+            self._prioritise(index, state["priorities"].cpu())
+            self._generator.set_state(state["generator"].cpu())
+
+
+class LeastPriorityWriter(Writer):
+    """A writer that fills the storage in order, and then overwrites the transitions with the least current priority.
+
+    TorchRL's ``TensorDictMaxValueWriter`` ranks transitions by their value when they are written. The paper ranks them
+    by the sampling probability, which changes with every update of the critic.
+
+    Args:
+        capacity: number of places.
+    """
+
+    def __init__(self, capacity: int):
+        super().__init__()
+        self.priorities = np.zeros(capacity, dtype=np.float32)
+        """Priority of the transition in each place; of equal ones the first goes first."""
+
+    def add(self, data: TensorDictBase) -> int:
+        return int(self.extend(data.unsqueeze(0))[0])
+
+    def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
+        stored, capacity, n = len(self._storage), len(self.priorities), len(data)
+        if n > capacity:
+            raise ValueError(
+                f"{n} transitions at once do not fit a long-term memory of {capacity}; raise capacity to at least one "
+                "episode."
+            )
+        free = np.arange(stored, min(stored + n, capacity))
+        evicted = self.priorities[:stored].argsort(kind="stable")[: n - len(free)]
+        index = torch.from_numpy(np.concatenate([free, evicted]))
+        data.set("index", index)
+        self._storage.set(index, data)
+        return index
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        """Forget nothing, because the storage knows its length and the memory its priorities."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore nothing; :class:`LongTermMemory` restores the priorities."""
+
+    def dumps(self, path: str) -> None:
+        """Write nothing; see :meth:`load_state_dict`."""
+
+    def loads(self, path: str) -> None:
+        """Read nothing; see :meth:`load_state_dict`."""
+
+
+class MakeLearner(Protocol):
+    """A function that makes the learner of step 2; :class:`ActorCritic` describes the arguments."""
+
+    def __call__(
+        self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator
+    ) -> Learner: ...
