@@ -26,7 +26,6 @@ ONE_OF_EACH = dataclasses.replace(
     assimilation=AssimilationConfig(iterations=1),
     planner=PlannerConfig(iterations=1),
     learner=dataclasses.replace(SMALL.learner, critic_iterations=2, actor_iterations=1),
-    distillation=dataclasses.replace(SMALL.distillation, iterations=2),
 )
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
