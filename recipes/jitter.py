@@ -12,6 +12,7 @@ if __name__ == "__main__":
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from rt_torchrl import OperationConfig, check_options, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
@@ -73,13 +74,14 @@ class Learner:
         from wind_turbine import CONVERGED
 
         self.algorithm = ReinforcementTwinning(env, twin, **self.policies, config=CONVERGED, generator=generator)
-        self.algorithm.episode()
+        self.episode = self.algorithm(TensorDict({"number": 0}))
 
     def learn(self) -> float:
         """Learn once; the time that it took [s]."""
-        algorithm, begun = self.algorithm, time.perf_counter()
-        for step in ("update_model_free", "fit_exogenous", "assimilate", "examine", "plan", "switch_policies"):
-            getattr(algorithm, step)()
+        begun = time.perf_counter()
+        for name, step in self.algorithm.module.items():
+            if name != "interact":
+                step(self.episode)
         return time.perf_counter() - begun
 
 

@@ -55,7 +55,7 @@ from .fit.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
-from .twinning.algorithm import ReinforcementTwinning
+from .algorithm import ReinforcementTwinning
 from .twinning.assimilation import AssimilationConfig
 from .twinning.hypotheses.config import HypothesesConfig
 from .twinning.hypotheses.ensemble import TwinEnsemble

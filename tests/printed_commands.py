@@ -30,3 +30,11 @@ def commands() -> list[str]:
 def options() -> list[str]:
     """Every group of options that a sentence or a table names on its own, once."""
     return list(dict.fromkeys(span for page in TEXTS for span in spans(page) if span.startswith("--")))
+
+
+def documented(page: str, name: str) -> type:
+    """The class of this name from the code on a page of the documentation."""
+    (code,) = [code for code in blocks(page, "python") if f"class {name}" in code]
+    scope: dict[str, type] = {}
+    exec(code, scope)
+    return scope[name]

@@ -1,12 +1,13 @@
 """The six steps together, on the linear-quadratic plant, where the right closure and the right gain are known."""
 
-import functools
-
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
+from printed_commands import documented
+from tensordict import TensorDict
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
@@ -14,11 +15,10 @@ from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 
-STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "examine", "plan", "switch_policies"]
+STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 
 
 def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
@@ -44,6 +44,15 @@ def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
     )
 
 
+def flown(found, *steps, episode=None):
+    """The episode after these steps, by default the first one."""
+    if episode is None:
+        episode = TensorDict({"number": found.episodes_done}).set_non_tensor("live", found.referee.live)
+    for name in steps or ("interact",):
+        episode = found.module[name](episode)
+    return episode
+
+
 def weights(module):
     return torch.cat([w.detach().flatten() for w in module.parameters()]).clone()
 
@@ -55,17 +64,11 @@ def scripted(found, live, idle):
 
 
 @pytest.mark.parametrize(
-    "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:6]])]
+    "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:5]])]
 )
 def test_steps_come_in_order(arm, expected):
     found, calls = twinning(arm=arm), []
-
-    def recorded(step):
-        return functools.wraps(step)(lambda: calls.append(step.__name__) or step())
-
-    for name in STEPS:
-        setattr(found, name, recorded(getattr(found, name)))
-    report = found.episode()
+    report = found.episode(calls.append)
     assert calls == expected and list(report["seconds"].keys()) == expected
     assert found.episodes_done == 1
     assert ("J_p" in report) == (arm != "model_free") and ("critic_loss" in report) == (arm != "model_based")
@@ -104,12 +107,12 @@ def test_arms_touch_their_own_half_alone():
 def test_what_is_stored_is_what_was_applied():
     """The turbine's rate limits change most commands of a policy with noise."""
     found = twinning(WindTurbine(horizon=30.0), exploration=ExplorationConfig(spread=1.0, episodes=5))
-    flown = []
+    rollouts = []
     fly = found.collector.rollout
-    found.collector.rollout = lambda: flown.append(fly()) or flown[-1]
-    found.interact()
+    found.collector.rollout = lambda: rollouts.append(fly()) or rollouts[-1]
+    flown(found)
     (record,) = found.short_term
-    (commands,) = flown[-1]["action"]
+    (commands,) = rollouts[-1]["action"]
     stored = found.learner.memory.buffer[:60]
     # The plant latches the applied action into the state at the end of the interval.
     # The flight computes it in machine code, and the record from the states of the flight: rounding.
@@ -124,9 +127,7 @@ def test_the_true_twin_replays_the_record_exactly_under_the_measured_input_only(
     plant = LinearQuadratic(horizon=2.0)
     config = AssimilationConfig(iterations=1, inputs=inputs)
     found = twinning(plant, closure=LinearClosure(plant.closure.matrix.clone()), assimilation=config)
-    found.interact()
-    found.fit_exogenous()
-    J_p = found.assimilate()["J_p_before"].item()
+    J_p = flown(found, "interact", "inputs", "assimilate")["J_p_before"].item()
     assert (J_p < 1e-20) == (inputs == "record")
 
 
@@ -142,7 +143,7 @@ def test_step_five_may_plan_on_a_number_of_its_own():
 def test_record_and_transitions_are_those_of_the_episode():
     found = twinning(records=2)
     for _ in range(3):
-        report = found.interact()
+        report = flown(found)
     assert len(found.short_term) == 2 and len(found.learner.memory) == 60
     record, last = found.short_term[-1], found.learner.memory.buffer[40:60]
     # On this plant the observation is the state.
@@ -162,12 +163,13 @@ def test_live_starts_model_free_and_explores_less_and_less():
 
 def test_swap_changes_who_acts_and_copies_nothing():
     found = twinning(referee=RefereeConfig(patience=0))
-    found.interact(), found.update_model_free(), found.fit_exogenous()
+    episode = flown(found, "interact", "learn", "inputs")
+    episode["weight_changes", "model_based"] = 0.0
     before = {role: weights(policy) for role, policy in found.policies.items()}
     scripted(found, live=2.0, idle=1.0)
-    assert found.switch_policies()["event"] == "swap"
+    assert flown(found, "switch", episode=episode)["event"] == "swap"
     assert found.referee.live == "model_based"
-    found.interact()
+    flown(found)
     assert found.actor.policy is found.policies["model_based"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
 
@@ -176,8 +178,7 @@ def test_swap_changes_who_acts_and_copies_nothing():
 def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
     found = twinning(referee=RefereeConfig(clone_patience=0, stall=1e9))
     found.referee.live = live
-    for step in STEPS[:-1]:
-        getattr(found, step)()
+    episode = flown(found, *STEPS[:-1])
     optimisers = {
         "model_free": lambda: found.learner.actor_adam.steps[0].item(),
         "model_based": lambda: found.planner.descent._optimiser.state,
@@ -186,7 +187,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
     assert all(state() for state in optimisers.values())
     assert not torch.equal(weights(found.policies[idle]), before)
     scripted(found, live=1.0, idle=2.0)
-    assert found.switch_policies()["event"] == "clone"
+    assert flown(found, "switch", episode=episode)["event"] == "clone"
     assert torch.equal(weights(found.policies[idle]), before) and torch.equal(weights(found.policies[live]), before)
     assert found.policies[idle] is not found.policies[live] and found.referee.live == live
     assert not optimisers[idle]() and optimisers[live]()
@@ -223,8 +224,7 @@ def test_identification_finds_the_true_closure():
         assimilation=AssimilationConfig(iterations=80, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
         exploration=ExplorationConfig(spread=0.5, episodes=5),
     )
-    found.interact(), found.fit_exogenous()
-    report = found.assimilate()
+    report = flown(found, "interact", "inputs", "assimilate")
     # A noise-free record of the same system: J_p goes to zero, until L-BFGS stops at changes below 1e-9.
     assert report["J_p"] < 1e-4 * report["J_p_before"] and report["J_p"] < 1e-7
     # J_p of 1e-7 over 5 s is a trajectory off by 2e-4; an oscillation of size one tells the weights as well.
@@ -242,8 +242,8 @@ def test_planning_finds_the_optimal_gain():
         realisations=8,
         planner=PlannerConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     )
-    found.interact(), found.fit_exogenous()
-    report = found.plan()
+    episode = flown(found, "interact", "inputs")
+    report = flown(found, "plan", episode=episode)
     assert report["J_a_plan"] < report["J_a_plan_before"]
     gain, best = found.policies["model_based"].gain.detach().numpy(), optimal_gain(1.0)
     # L-BFGS stops at cost changes of 1e-9; the cost curves with about 0.1 per unit of gain²: 1e-4, and the tail.
@@ -254,8 +254,7 @@ def test_costs_of_both_policies_are_from_the_same_draws():
     """Equal policies cost the same, whatever was drawn; and the draws differ from call to call."""
     found = twinning(virtual_episodes=4, records=2)
     for _ in range(2):
-        found.interact()
-    found.fit_exogenous()
+        flown(found, "interact", "inputs")
     found.policies["model_based"].load_state_dict(found.policies["model_free"].state_dict())
     first, second = ({}, {})
     for costs in (first, second):
@@ -268,3 +267,36 @@ def test_costs_of_both_policies_are_from_the_same_draws():
 def test_wrong_counts_are_refused(argument):
     with pytest.raises(ValueError, match=f"{argument}=0 must be at least 1"):
         TwinningConfig(**{argument: 0})
+
+
+def test_a_step_of_ones_own_flows_with_the_others():
+    """The twin is the real system, so that the residual of the page is rounding."""
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(
+        plant, closure=LinearClosure(plant.closure.matrix.clone()), assimilation=AssimilationConfig(iterations=0)
+    )
+    found.insert("residual", documented("method.md", "Residual")(found.twin), before="plan")
+    report = found.episode()
+    assert report["residual"] < 1e-9 and list(report["seconds"].keys()) == [*STEPS[:4], "residual", *STEPS[4:]]
+    with pytest.raises(ValueError, match="before='planning' is no step of this arm; choose one of interact, learn"):
+        found.insert("other", found.module["plan"], before="planning")
+
+
+def test_keys_flow_as_the_steps_declare():
+    """Each step finds what it reads, and writes what it says."""
+    found = twinning()
+    episode = TensorDict({"number": 0}).set_non_tensor("live", found.referee.live)
+    for name, step in found.module.items():
+        assert all(key in episode.keys(include_nested=True) for key in step.in_keys), name
+        episode = step(episode)
+        assert all(key in episode.keys(include_nested=True) for key in step.out_keys), name
+    record, n = episode["record"], found.twin.plant.n_steps
+    assert record["states"].shape == (n + 1, 2) and record["actions"].shape == record["exogenous"].shape == (n, 1)
+    assert len(episode["transitions", "0"]) == n and episode["large_scale"].shape == (n, 1)
+    assert set(found.in_keys) == {"number", "live"}
+
+
+def test_an_arm_is_a_shorter_sequence():
+    found = twinning()
+    arm = found.select_subsequence(out_keys=[("weight_changes", "model_free")])
+    assert list(arm.module) == STEPS[:2]

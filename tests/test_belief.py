@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from test_algorithm import twinning
+from tensordict import TensorDict
+from test_algorithm import flown, twinning
 
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import COMMON, HISTORY, LENGTH, NOISE, Belief, alarm, difference
 from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.learn import Learn
+from rt_torchrl.steps.report import findings
 from rt_torchrl.steps.switch import Evidence, ExpectedCost
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.learning import Learning
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
 QUIET = ExplorationConfig(spread=0.0)
@@ -32,7 +34,10 @@ class ByGain(VirtualEpisodes):
     def __init__(self):
         plant = LinearQuadratic(horizon=2.0)
         self.twin, self.constraints, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), None, ()
-        self.flights = 0
+        self.flights, self.processes = 0, [None]
+
+    def draw(self, count):
+        return EPISODES
 
     def cost(self, policy, episodes):
         self.flights += 1
@@ -212,7 +217,7 @@ def test_episodes_that_explore_raise_no_alarm(spread, raised):
     report_costs(found, 2.0)
     reports = []
     for _ in range(2):
-        found.interact()
+        flown(found)
         reports.append(found.belief.examine())
     assert [report["alarm"].item() for report in reports] == raised
     assert not raised[1] or "times as much as the twin says of them" in reports[1]["warning"]
@@ -229,7 +234,7 @@ def test_what_contradicts_the_twin(factor, spread, contradicted):
     exploration = ExplorationConfig(spread=spread, episodes=10**6)
     found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=exploration)
     report_costs(found, factor)
-    found.interact()
+    flown(found)
     assert found.belief.contradicted == contradicted
 
 
@@ -260,18 +265,14 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
 
 def test_two_identical_policies_never_change_roles():
     found = twinning(exploration=QUIET)
-    found.learner.update = dict
-    found.planning.plan = lambda *arguments: {}
     live, idle = found.referee.live, found.referee.idle
     found.policies[idle].load_state_dict(found.policies[live].state_dict())
     report_costs(found, 2.0)
-    found.interact()
-    found.update_model_free = None
-    found._earlier_weights = {role: torch.ones(2).double() for role in found.policies}
-    found.fit_exogenous()
-    found.learning._before = found.learner.policy.state_dict()
+    changes = {"weight_changes": {role: torch.ones(()) for role in found.policies}}
+    episode = found.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", live)).update(changes)
+    found.module["inputs"](episode)
     for _ in range(4):
-        assert found.switch_policies()["event"] != "swap" and found.referee.live == live
+        assert found.module["switch"](episode)["event"] != "swap" and found.referee.live == live
 
 
 def test_the_cheaper_policy_acts():
@@ -306,39 +307,15 @@ class Hasty(Content):
 
     def update(self):
         self.policy.load_state_dict(gains(2.0))
+        return findings()
 
 
 @pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])
 def test_an_update_that_flights_refute_is_taken_back(corrects, kept):
     belief, learner = belief_of(*REFUTED, corrects=corrects), Hasty(LinearGain([[3.0, 0.0]]))
-    learning = Learning(learner, belief.virtual)
-    learning.update()
-    report = learning.judge(EPISODES, belief)
-    assert said(learner.policy) == kept and report["update_accepted"] == float(not corrects)
-
-
-def test_an_update_that_was_taken_back_is_judged_again_where_the_step_is_repeated():
-    """With another closure, of which the flights may say something else."""
-    learner = Hasty(LinearGain([[3.0, 0.0]]))
-    learning = Learning(learner, ByGain())
-    learning.update()
-    assert learning.judge(EPISODES, belief_of(*REFUTED))["update_accepted"] == 0.0
-    assert learning.judge(EPISODES, belief_of())["update_accepted"] == 1.0 and said(learner.policy) == 2.0
-
-
-@pytest.mark.parametrize("sound", [False, True])
-def test_an_unsound_twin_leaves_the_update_to_another_closure(sound, monkeypatch):
-    """Nothing flies on the twin. If what has flown does not, either, the step is repeated, with the update."""
-    belief, learner = belief_of((1.0, 0.0)), Hasty(LinearGain([[3.0, 0.0]]))
-    monkeypatch.setattr(belief.virtual, "cost", lambda policy, _: 1.0 if sound and said(policy) == 1.0 else math.inf)
-    learning = Learning(learner, belief.virtual)
-    learning.update()
-    if sound:
-        assert learning.judge(EPISODES, belief)["update_accepted"] and said(learner.policy) == 2.0
-    else:
-        with pytest.raises(DivergenceError):
-            learning.judge(EPISODES, belief)
-        assert said(learner.policy) == 2.0
+    learned = Learn(learner, belief, 1)(TensorDict({"transitions": {}}))
+    assert said(learner.policy) == kept and ("update_accepted" in learned) == corrects
+    assert learned["weight_changes", "model_free"] == pytest.approx(0.0 if corrects else 0.5)
 
 
 class Other(LinearGain):

@@ -11,12 +11,12 @@ import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.tensor_file import load_tensors, plain, save_tensors
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 QUICK = {"figures": False, "untrained": 0}
 

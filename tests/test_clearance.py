@@ -8,6 +8,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_algorithm import twinning
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
@@ -19,7 +20,6 @@ from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
 
@@ -85,7 +85,7 @@ def test_a_policy_that_would_leave_them_does_not_act():
     last = found.clearance.choose(live, 5)
     assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
     assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
-    assert found.interact()["live"] == idle
+    assert flown(found)["live"] == idle
     assert torch.equal(found.belief.policy_of(found.belief.flown[-1]).gain, last.policy.gain)
 
 

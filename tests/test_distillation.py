@@ -4,19 +4,18 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
-from test_algorithm import STEPS, twinning, weights
+from test_algorithm import STEPS, flown, twinning, weights
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.imitation import Imitation, ShareOfRange, match_actions
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.report import same_architecture
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.findings import findings
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -120,8 +119,7 @@ def two_architectures(**options):
 def test_a_clone_event_distils(live):
     found = two_architectures()
     found.referee.live = live
-    for step in STEPS[:-1]:
-        getattr(found, step)()
+    episode = flown(found, *STEPS[:-1])
     idle = found.referee.idle
     before, replaced = weights(found.policies[live]), weights(found.policies[idle])
     judge, poor = found.belief.judge, found.policies[idle]
@@ -130,7 +128,7 @@ def test_a_clone_event_distils(live):
         return Judged(1e9, 1e9) if policy is poor and torch.equal(weights(poor), replaced) else judge(policy, episodes)
 
     found.belief.judge = judged
-    report = found.switch_policies()
+    report = flown(found, "switch", episode=episode)
     assert report["event"] == "clone" and torch.equal(weights(found.policies[live]), before)
     assert 0.0 < report["distillation_error"] < 0.05
     # The clone costs what the live policy does, within what an action of 5 % of the range can change.
@@ -142,13 +140,11 @@ def test_a_clone_event_distils(live):
 def test_a_refused_clone_is_no_event_and_says_why():
     found = two_architectures()
     found.referee.live = "model_based"
-    for step in STEPS[:-1]:
-        getattr(found, step)()
+    episode = flown(found, *STEPS[:-1])
     before = {role: weights(policy) for role, policy in found.policies.items()}
     costs = iter([1e-9, 2e-9, 2e-9, 1.0])  # of both policies, of that which is replaced, of its clone
-    found.learning.judge = lambda *arguments: findings()
     found.belief.judge = lambda policy, episodes: Judged(cost := next(costs), cost)
-    report = found.switch_policies()
+    report = flown(found, "switch", episode=episode)
     assert report["event"] == "keep" and "clone refused" in report["reason"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
     assert found.referee.stall_count == 0

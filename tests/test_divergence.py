@@ -1,19 +1,18 @@
 """What diverges on the twin: a closure, a plan, an idle policy, and a live one that its update has ruined."""
 
 import dataclasses
-import functools
 
 import pytest
 import torch
 from tensordict import TensorDict
-from test_algorithm import twinning, weights
+from test_algorithm import flown, twinning, weights
 
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.report import EpisodeReport, findings
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.findings import EpisodeReport
 
 
 def unsound(found, monkeypatch, episodes):
@@ -30,7 +29,7 @@ def unsound(found, monkeypatch, episodes):
     monkeypatch.setattr(found.assimilation, "update", updated)
 
 
-@pytest.mark.parametrize("step", ["plan", "switch_policies"])
+@pytest.mark.parametrize("step", ["plan", "switch"])
 def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step):
     found, sound = twinning(), twinning()
     for algorithm in (found, sound):
@@ -40,9 +39,9 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step):
     # Compared with an algorithm whose step 4 finds nothing new, and whose planning begins afresh.
     sound.planner.restart()
     sound.assimilation.config = dataclasses.replace(sound.assimilation.config, iterations=0)
-    if step == "switch_policies":
+    if step == "switch":
         for algorithm in (found, sound):
-            monkeypatch.setattr(algorithm, "plan", functools.wraps(algorithm.plan)(lambda: TensorDict({})))
+            monkeypatch.setattr(algorithm.planning, "plan", lambda *arguments: findings())
     report, expected = found.episode(), sound.episode()
     assert report["closure_refused"] == 1.0 and expected["closure_refused"] == 0.0
     assert report["reason"].startswith("closure refused: plant") and "diverged" in report["reason"]
@@ -183,7 +182,7 @@ def test_a_twin_that_diverges_under_its_first_closure_too_says_so_and_keeps_what
         for weight in found.twin.closure.parameters():
             weight.fill_(1e3)
     found.assimilation.first = {name: torch.full_like(w, 1e4) for name, w in found.assimilation.first.items()}
-    report = found.assimilate()
+    report = flown(found, "assimilate", episode=TensorDict({}))
     assert report["J_p_before"].isinf() and report["J_p"].isinf()
     assert all((weight == 1e3).all() for weight in found.twin.closure.parameters())
     assert "twin: J_p diverges, diverges before assimilation" in repr(EpisodeReport(report))
@@ -194,13 +193,15 @@ def test_a_twin_goes_back_to_its_first_closure_if_the_earlier_one_diverges_too(m
     first = weights(found.twin.closure).clone()
     found.episode()
     unsound(found, monkeypatch, {1})
-    kept = found.earlier.remember
+    fit = found.steps["assimilate"].fit
 
-    def remembered_unsound():
-        kept()
-        found.earlier._closure = {name: torch.full_like(w, 1e300) for name, w in found.earlier._closure.items()}
+    def fitted(records):
+        report = fit(records)
+        step = found.steps["assimilate"]
+        step.closure_before = {name: torch.full_like(w, 1e300) for name, w in step.closure_before.items()}
+        return report
 
-    monkeypatch.setattr(found.earlier, "remember", remembered_unsound)
+    monkeypatch.setattr(found.steps["assimilate"], "fit", fitted)
     report = found.episode()
     assert report["closure_refused"] == 1.0
     assert torch.equal(weights(found.twin.closure), first)

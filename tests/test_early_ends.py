@@ -11,6 +11,7 @@ from falling_plant import Falling
 from linear_quadratic import LinearClosure, LinearGain
 from printed_commands import blocks
 from small_runs import SMALL
+from test_algorithm import flown
 from test_real_system import MILLIMETRES, Rig, connected
 
 from rt_torchrl import (
@@ -201,7 +202,7 @@ def test_a_right_twin_foretells_the_cost_of_an_episode_that_ended():
     plant = Falling(noise=0.0)  # no input has to be continued
     quiet = dataclasses.replace(SMALL, exploration=ExplorationConfig(spread=0.0))
     found = algorithm(PlantEnv(plant, seed=1), plant, quiet, LinearClosure(plant.true_closure))
-    found.interact()
+    flown(found)
     assert len(found.short_term[-1].actions) < plant.n_steps
     (difference,) = found.belief.differences()
     assert difference == pytest.approx(0.0, abs=1e-9)

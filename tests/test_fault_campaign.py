@@ -25,6 +25,7 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from tensordict.nn import TensorDictModule
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -39,7 +40,6 @@ from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""

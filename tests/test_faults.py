@@ -10,12 +10,12 @@ from small_runs import SMALL
 from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import FaultySystem, Injection
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 DT, N = 0.1, 40
 WATCHED = {

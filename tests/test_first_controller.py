@@ -6,18 +6,18 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD, episodes
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
+from rt_torchrl.steps.start import FirstController
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.starts import FirstController
 
 GAINS = (0.4, 0.3)
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torchrl.envs import GymWrapper
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
@@ -13,7 +14,6 @@ from rt_torchrl.systems.reading import Actuation, Reading
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 

@@ -7,7 +7,9 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
+from tensordict import TensorDict
 
+from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
@@ -15,14 +17,10 @@ from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import PlannerConfig
-from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.earlier_closure import EarlierClosure
-from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, counting, evidence
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
@@ -361,20 +359,21 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
 
 def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     """The step diverges for as long as a hypothesis counts."""
-    twin, assimilation = ensemble(PLANT)
-    twin.weights = {"late": 1.0}
-    policy, weights = LinearGain([[1.0, 1.0]]), []
-    generator = torch.Generator()
-    planner = make_planner(twin, policy, PlannerConfig(), generator=generator)
+    twin, _ = ensemble(PLANT)
+    policies = {role: LinearGain([[1.0, 1.0]]) for role in ("model_free", "model_based")}
+    config, generator = TwinningConfig(assimilation=ASSIMILATION), torch.Generator()
+    found = ReinforcementTwinning(PlantEnv(PLANT, seed=0), twin, **policies, config=config, generator=generator)
+    found.twin.weights = {"late": 1.0}
+    seen = []
 
-    def step():
-        weights.append(twin.weights)
-        if "late" in twin.weights:
+    def step(episode):
+        seen.append(found.twin.weights)
+        if "late" in found.twin.weights:
             raise DivergenceError("late diverges")
-        return findings()
+        return episode
 
-    report = EarlierClosure(twin, policy, planner, generator, assimilation).sound(step)
-    assert weights == [{"late": 1.0}, {ALONE: 1.0}] and report["closure_refused"] == 1.0
+    report = found._sound(step, TensorDict())
+    assert seen == [{"late": 1.0}, {ALONE: 1.0}] and report["closure_refused"] == 1.0
     assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
 
 

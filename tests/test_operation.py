@@ -8,6 +8,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
@@ -18,7 +19,6 @@ from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.systems.operation.event_log import EventLog
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 

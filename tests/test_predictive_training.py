@@ -11,6 +11,7 @@ from small_runs import SMALL
 from test_export_recipe import recipe
 from torch import nn
 
+from rt_torchrl.algorithm import ReinforcementTwinning, share_critic
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.figures.policy import policy_contours
 from rt_torchrl.optimisers.descent import DescentConfig
@@ -28,7 +29,6 @@ from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, share_critic
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2))

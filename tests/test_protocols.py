@@ -2,16 +2,17 @@
 
 import copy
 import io
-import re
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from printed_commands import documented
 from seeds_and_numbers import seeded
-from test_algorithm import twinning, weights
+from test_algorithm import flown, twinning, weights
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
 from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
 from rt_torchrl.steps.plan import Planner, WholeEpisodes
@@ -19,20 +20,10 @@ from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)
 SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16, "critic_hidden": (8,)}
-
-
-def documented(page, name):
-    """The class of this name from the code on a page of the documentation."""
-    codes = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
-    (code,) = [code for code in codes if f"class {name}" in code]
-    scope = {}
-    exec(code, scope)
-    return scope[name]
 
 
 def actor_critic(algorithm, policy):
@@ -98,8 +89,8 @@ def test_a_training_with_each_goes_on_from_its_state_as_if_never_interrupted(par
 def test_learners_train_their_policy_in_place_and_no_other(name):
     found = algorithm(learner=LEARNERS[name])
     before = {role: weights(policy) for role, policy in found.policies.items()}
-    found.interact()
-    report = found.update_model_free()
+    episode = flown(found)
+    report = found.learner.update() if found.learner.store(episode["transitions", "0"]) is None else None
     assert all(value.isfinite() for value in report.values())
     assert not torch.equal(weights(found.policies["model_free"]), before["model_free"])
     assert torch.equal(weights(found.policies["model_based"]), before["model_based"])
@@ -109,7 +100,7 @@ def test_learners_train_their_policy_in_place_and_no_other(name):
 @pytest.mark.parametrize("name", PLANNERS)
 def test_planners_improve_their_policy_on_what_they_are_given(name):
     found = algorithm(planner=PLANNERS[name])
-    found.interact(), found.fit_exogenous()
+    flown(found, "interact", "inputs")
     episodes, policy = found.virtual.draw(8), found.policies["model_based"]
     before = found.virtual.cost(policy, episodes)
     plan = found.planner.plan(episodes)
@@ -147,9 +138,9 @@ def test_the_belief_predicts_the_cost_of_the_flight_itself():
     from rt_torchrl.systems.exploration import ExplorationConfig
 
     found = twinning(PLANT, closure=copy.deepcopy(PLANT.closure), exploration=ExplorationConfig(episodes=0))
-    found.interact()
+    flown(found)
     found.policies["model_free"].load_state_dict({"gain": torch.tensor([[0.9, 1.2]], dtype=torch.float64)})
-    found.interact()
+    flown(found)
     real = [one.cost for one in found.belief.flown]
     assert len(real) == 2 and real[0] != real[1]
     assert found.belief.differences() == pytest.approx([0.0, 0.0], abs=1e-12)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import fresh_process
 import pytest
+from tensordict import TensorDict
 
 ROOT = Path(__file__).resolve().parent.parent
 TUTORIAL = (ROOT / "docs" / "own_plant.md").read_text(encoding="utf-8")
@@ -15,7 +16,11 @@ def test_its_code_runs(monkeypatch):
     from rt_torchrl import ReinforcementTwinning
 
     # The steps are tested elsewhere and take minutes here; what is tested is that the snippet builds them.
-    monkeypatch.setattr(ReinforcementTwinning, "episode", lambda self: self.interact())
+    monkeypatch.setattr(
+        ReinforcementTwinning,
+        "episode",
+        lambda self: self.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", self.referee.live)),
+    )
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     scope = {}
     exec(code, scope)

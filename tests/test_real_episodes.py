@@ -3,12 +3,12 @@
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from test_algorithm import twinning
+from test_algorithm import flown, twinning
 from test_real_system import Rig, connected
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 HORIZON = 2.0
 
@@ -72,7 +72,7 @@ def test_episodes_of_a_simulation_are_every_second_draw_of_its_seed(guarded):
     found = algorithm(SafetyLayer(env, SafetyConfig(interval=0.1), fallback=(0.0,)) if guarded else env)
     generator = torch.Generator().manual_seed(4)
     for _ in range(3):
-        found.interact()
+        flown(found)
         for _ in range(2):
             state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
         record = found.short_term[-1]
@@ -95,7 +95,7 @@ class Costly(PlantEnv):
 def test_what_a_subclass_overrides_takes_effect():
     plant = LinearQuadratic(horizon=HORIZON)
     found = algorithm(Costly(plant, seed=4))
-    report, record = found.interact(), found.short_term[-1]
+    report, record = flown(found), found.short_term[-1]
     assert torch.equal(record.states[0], torch.zeros(2).double())
     cost = plant.running_cost(torch.zeros(20).double(), record.states[:-1], record.actions, record.exogenous)
     # Rounding of twenty sums.

@@ -8,6 +8,7 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -17,7 +18,6 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 
 def refused(name):

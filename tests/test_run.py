@@ -14,6 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl import PlantContractError
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
@@ -22,7 +23,6 @@ from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 

@@ -12,10 +12,10 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 DT = 0.1
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
+from tensordict import TensorDict
 from test_classical import PD
 from test_export_recipe import recipe
 from test_hypotheses import ASSIMILATION as NEWTON
@@ -23,14 +24,14 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.imitation import clones
+from rt_torchrl.steps.report import findings
+from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.starts.recorded_flights import transitions_of
 
 record_log = recipe("record_log")
 ClassicalLaw, recorded = record_log.ClassicalLaw, record_log.recorded
@@ -99,14 +100,14 @@ def test_a_twin_that_diverges_falls_back_to_the_closure_that_the_training_starte
     found = run.algorithm
     closure, outcomes = found.twin.closure, [DivergenceError("the twin diverged"), findings()]
 
-    def step():
+    def step(episode):
         outcome = outcomes.pop(0)
         if isinstance(outcome, Exception):
             raise outcome
-        return outcome
+        return episode.update(outcome)
 
     torch.nn.init.constant_(closure.matrix, 1e300)
-    assert found.earlier.sound(step)["closure_refused"] == 1.0
+    assert found._sound(step, TensorDict())["closure_refused"] == 1.0
     assert torch.equal(closure.matrix, first)
     # In step 4, too: of a descent of one gradient the weights stay that it begins with.
     torch.nn.init.constant_(closure.matrix, 1e3)

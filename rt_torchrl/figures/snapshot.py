@@ -12,7 +12,7 @@ from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from rt_torchrl.twinning.algorithm import ReinforcementTwinning  # only its type: it loads TorchRL
+    from rt_torchrl.algorithm import ReinforcementTwinning  # only its type: it loads TorchRL
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,11 +30,11 @@ FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"
 ROLES: dict[Role, str] = {"model_based": "#0072B2", "model_free": "#E69F00"}
 STEPS = {
     "interact": REAL,
-    "update_model_free": ROLES["model_free"],
-    "fit_exogenous": SAMPLES,
+    "learn": ROLES["model_free"],
+    "inputs": SAMPLES,
     "assimilate": TWIN,
     "plan": ROLES["model_based"],
-    "switch_policies": "#CC79A7",
+    "switch": "#CC79A7",
 }
 
 LIMIT_LINE: dict[str, Any] = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.tensor_file import DamagedFileError, load_tensors, save_tensors
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 NAME = "checkpoint.pt"
 """File of the newest checkpoint in a run folder."""

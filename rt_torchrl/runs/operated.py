@@ -8,9 +8,11 @@ import torch
 from torch import nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.start import Start
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.cores import chosen_core
 from rt_torchrl.systems.operation.event_log import EventLog
@@ -19,8 +21,6 @@ from rt_torchrl.systems.operation.order import FIRST
 from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.real_system import episode_seed
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.starts import Start
 
 EVENTS = "events.jsonl"
 """File of the operation's events in a run folder."""

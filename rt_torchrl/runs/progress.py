@@ -13,12 +13,11 @@ from rt_torchrl.trajectories.engines.parallel import watched_compilation
 WORDS = {
     "start": "learning from what is known",
     "interact": "real episode",
-    "update_model_free": "model-free update",
-    "fit_exogenous": "fitting the input",
+    "learn": "model-free update",
+    "inputs": "fitting the input",
     "assimilate": "assimilating",
-    "examine": "examining the twin",
     "plan": "planning",
-    "switch_policies": "comparing policies",
+    "switch": "comparing policies",
 }
 """Words in which the bar shows each step of the algorithm."""
 ON_TERMINAL, IN_FILE = 0.5, 30.0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, mean_with_confidence
@@ -18,7 +19,6 @@ from rt_torchrl.steps.imitation import clones
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 
 class Contender(NamedTuple):

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
@@ -18,7 +19,6 @@ from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")

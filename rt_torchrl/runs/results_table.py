@@ -9,7 +9,7 @@ from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.summary import on_the_twin
-from rt_torchrl.twinning.findings import in_words
+from rt_torchrl.steps.report import in_words
 
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""

@@ -12,6 +12,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
@@ -43,7 +44,6 @@ from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 
 class Run:

@@ -29,11 +29,10 @@ from torch.utils._pytree import tree_flatten
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.report import findings, same_architecture
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
-from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.findings import findings
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor

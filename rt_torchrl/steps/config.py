@@ -9,6 +9,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, require_widths
 
 Role = Literal["model_free", "model_based"]
+Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 RefereeName = Literal["decision_tree", "expected_cost"]
 LargeScale = Literal["met", "mixed"]

@@ -27,11 +27,10 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.report import findings, merged, same_architecture
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
-from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.findings import findings, merged
 
 Result = TypeVar("Result")
 

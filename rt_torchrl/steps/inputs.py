@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Complex, Float
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.constraints import Constraints
+from rt_torchrl.steps.report import Step
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.flight import Flight
+from rt_torchrl.twinning.flight import Flight, RealFlights
 
 ENOUGH = 3
 """Number of episodes from which on their large scales say how much others may differ."""
@@ -384,3 +386,25 @@ class VirtualEpisodes:
         self.processes.extend(
             ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
         )
+
+
+class FitInputs(Step):
+    """Step 3: fit a Gaussian process to the exogenous input of the episode, if it is whole.
+
+    Reads ``record``. Writes ``large_scale``, the large scale d̃ of the inputs that act, n × n_z, of the last process.
+
+    Args:
+        virtual: virtual episodes, which keep the processes.
+        flights: real episodes, of which the latest says whether it is whole.
+    """
+
+    in_keys = ["record"]
+    out_keys = ["large_scale"]
+
+    def __init__(self, virtual: VirtualEpisodes, flights: RealFlights):
+        super().__init__(virtual=virtual)
+        self.virtual, self.flights = virtual, flights
+
+    def forward(self, episode: TensorDictBase) -> TensorDictBase:
+        self.virtual.learn_flight(self.flights.latest)
+        return episode.set("large_scale", self.virtual.processes[-1].mean)

@@ -11,7 +11,7 @@ import contextlib
 import copy
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -33,7 +33,9 @@ from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
+from rt_torchrl.steps.report import Step, findings, merged, weight_change, weight_vector
 from rt_torchrl.systems.refusal import finite_errors, finite_transitions
 
 
@@ -750,3 +752,56 @@ class MakeLearner(Protocol):
     def __call__(
         self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator
     ) -> Learner: ...
+
+
+class Learn(Step):
+    """Step 2: the learner improves π_mf; an update that is expected to cost more is taken back.
+
+    Reads ``transitions``. Writes ``weight_changes/model_free``, ‖w − w_before‖/‖w‖, and what the learner reports.
+
+    Note: the paper keeps every update. A critic knows the value of actions near those that were taken. Where a training
+    begins with a controller it explores little, and an actor that climbs the critic leaves those actions within one
+    update.
+
+    Args:
+        learner: the learner. One that needs more than one interval in a row says so by ``shortest``.
+        belief: what policies cost; without a twin yet, or where it does not correct, every update stays.
+        count: number of virtual episodes on which an update is judged.
+    """
+
+    in_keys = ["transitions"]
+    out_keys = [("weight_changes", "model_free")]
+
+    def __init__(self, learner: Learner, belief: Belief, count: int):
+        super().__init__(learner=learner)
+        self.learner, self.belief, self.count = learner, belief, count
+
+    def store(self, parts: Iterable[TensorDictBase]) -> None:
+        """Give the learner the transitions of the sound parts of an episode that it can use."""
+        shortest = getattr(self.learner, "shortest", 1)
+        for transitions in parts:
+            over = bool(transitions["next", "terminated"][-1].any())  # with an end, few intervals are enough
+            if over or len(transitions) >= shortest:
+                self.learner.store(transitions)
+
+    def forward(self, episode: TensorDictBase) -> TensorDictBase:
+        policy = self.learner.policy
+        self.store(episode["transitions"].values())
+        before, weights = copy.deepcopy(policy.state_dict()), weight_vector(policy)
+        report = self.learner.update()
+        if self.belief.corrects and self.belief.virtual.processes:
+            report = merged(report, self._judged(before))
+        return merged(episode, report).set(("weight_changes", "model_free"), weight_change(policy, weights))
+
+    @torch.no_grad()
+    def _judged(self, before: dict[str, Any]) -> TensorDict:
+        policy, episodes = self.learner.policy, self.belief.virtual.draw(self.count)
+        after, found = copy.deepcopy(policy.state_dict()), self.belief.judge(policy, episodes)
+        policy.load_state_dict(before)
+        earlier = self.belief.judge(policy, episodes)
+        if found > earlier:
+            self.learner.restart()
+            reason = f"update refused: J_a of model_free would be {found.price:.4g}, it was {earlier.price:.4g}"
+            return findings(reason, update_accepted=0.0)
+        policy.load_state_dict(after)
+        return findings(update_accepted=1.0)

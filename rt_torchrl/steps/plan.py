@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
@@ -16,11 +16,10 @@ from rt_torchrl.optimisers.limited_mean import limited_mean
 from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints
+from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.findings import findings, merged
 
 Weights = dict[str, Tensor]
 STRIDE = 1_000_003
@@ -407,3 +406,30 @@ class MultiStart:
 def planned(found: Descended) -> TensorDict:
     """The report of a plan that is kept."""
     return findings(J_a_plan_before=found.start, J_a_plan=found.best, policy_gradient=found.gradient, plan_accepted=1.0)
+
+
+class MakePlan(Step):
+    """Step 5: the planner improves π_mb on the twin with w_p*; a plan stays if it is expected to cost less.
+
+    Reads ``number``, ``J_p`` and ``large_scale``: the twin must have been fitted, and inputs be drawn. Writes
+    ``weight_changes/model_based`` and the report of :class:`MultiStart`.
+
+    Args:
+        planning: the plans of an episode.
+        count: number N_z of virtual episodes that plans are made on.
+        judged: number of virtual episodes on which they are judged.
+    """
+
+    in_keys = ["number", "J_p", "large_scale"]
+    out_keys = [("weight_changes", "model_based")]
+
+    def __init__(self, planning: MultiStart, count: int, judged: int):
+        super().__init__(planner=planning.planner, planning=planning)
+        self.planning, self.count, self.judged = planning, count, judged
+
+    def forward(self, episode: TensorDictBase) -> TensorDictBase:
+        policy, virtual = self.planning.planner.policy, self.planning.virtual
+        weights = weight_vector(policy)
+        planned_on, judged_on = map(virtual.draw, (self.count, self.judged))
+        report = self.planning.plan(int(episode["number"]) + 1, planned_on, judged_on)
+        return merged(episode, report).set(("weight_changes", "model_based"), weight_change(policy, weights))

@@ -1,10 +1,22 @@
 """Step 6: a referee says which policy acts next, and whether the idle one becomes a clone of it."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from rt_torchrl.steps.config import RefereeConfig, Role
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import ROLES, RefereeConfig, Role
+from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.interact import record_of
+from rt_torchrl.steps.learn import Learner
+from rt_torchrl.steps.plan import Planner
+from rt_torchrl.steps.report import Step, findings, merged
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 Event = Literal["keep", "swap", "clone"]
 
@@ -142,3 +154,71 @@ class DecisionTree(ExpectedCost):
 def make_referee(config: RefereeConfig, live: Role) -> Referee:
     """The referee that a configuration names; the role ``live`` starts live."""
     return DecisionTree(config, live) if config.rule == "decision_tree" else ExpectedCost(config, live)
+
+
+class Switch(Step):
+    """Step 6: the referee decides by what both policies cost over the same N virtual episodes.
+
+    Reads ``record`` and the relative ``weight_changes`` of both policies. Writes ``event``, ``J_a_model_based`` and
+    ``J_a_model_free`` on the twin, with the price of leaving bounds.
+
+    Args:
+        referee: the referee.
+        policies: both policies by role.
+        belief: what policies cost.
+        imitation: clones.
+        halves: learner and planner by role, of which the one whose policy becomes a clone starts afresh.
+        seen: function that gives observations of the real system.
+        count: number N of virtual episodes.
+    """
+
+    in_keys = ["record", ("weight_changes", "model_free"), ("weight_changes", "model_based")]
+    out_keys = ["event", "J_a_model_based", "J_a_model_free"]
+
+    def __init__(
+        self,
+        referee: Referee,
+        policies: Mapping[Role, nn.Module],
+        belief: Belief,
+        imitation: Imitation,
+        halves: Mapping[Role, Learner | Planner],
+        seen: Callable[[], Tensor],
+        count: int,
+    ):
+        super().__init__(referee=referee)
+        self.referee, self.policies, self.belief, self.imitation = referee, dict(policies), belief, imitation
+        self.halves, self.seen, self.count = halves, seen, count
+
+    @torch.no_grad()
+    def forward(self, episode: TensorDictBase) -> TensorDictBase:
+        """Take the step.
+
+        Raises:
+            DivergenceError: if the twin diverges under the weights that have just flown, too.
+        """
+        judged_on, live, idle = self.belief.virtual.draw(self.count), self.referee.live, self.referee.idle
+        costs = {role: self.belief.judge(self.policies[role], judged_on) for role in ROLES}
+        diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].price)]
+        if diverged:
+            self.belief.require_sound_twin(judged_on)
+        evidence = Evidence(
+            live_cost=costs[live].expected,
+            idle_cost=costs[idle].expected,
+            idle_weight_change=episode["weight_changes", idle].item(),
+            real_costs=tuple(one.cost for one in self.belief.flown),
+        )
+        event = self.referee.decide(evidence)
+        report = findings(*diverged, **{f"J_a_{role}": costs[role].price for role in ROLES})
+        report = report.update(findings(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
+        if event == "clone":
+            report = merged(report, self.clone(record_of(episode), judged_on))
+        return merged(episode, report)
+
+    def clone(self, record: Trajectory, judged_on: Scenario) -> TensorDict:
+        """Clone the live policy into the idle one, unless the clone is worse."""
+        live, idle = self.referee.live, self.referee.idle
+        policies = (self.policies[role] for role in (live, idle))
+        report = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)
+        if "reason" not in report:
+            self.halves[idle].restart()
+        return report

@@ -11,11 +11,11 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.report import findings
 from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.findings import findings
 
 
 class Cleared(NamedTuple):

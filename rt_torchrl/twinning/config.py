@@ -1,16 +1,13 @@
 """Hyper-parameters of the whole algorithm."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from rt_torchrl.options import check_options
-from rt_torchrl.steps.config import ExogenousConfig, LearnerConfig, PlannerConfig, RefereeConfig
+from rt_torchrl.steps.config import Arm, ExogenousConfig, LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-
-Arm = Literal["twinning", "model_free", "model_based"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.steps.report import findings
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.sound_part import (
@@ -21,7 +22,6 @@ from rt_torchrl.systems.sound_part import (
     tried_in_vain,
 )
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.findings import findings
 
 FLIGHTS = 3
 """Number of real episodes in a row without a sound part after which somebody has to look at the machine."""

@@ -1,5 +1,6 @@
 """Step 1 where the real system operates on while the algorithm learns."""
 
+from collections.abc import Sequence
 from typing import Protocol, cast, runtime_checkable
 
 import torch
@@ -9,12 +10,13 @@ from torch import nn
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.report import as_findings, findings, merged, plain
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST, Order
 from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.findings import as_findings, findings, merged, plain
 from rt_torchrl.twinning.flight import Flight, RealFlights, together
+from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 
 
 @runtime_checkable
@@ -26,14 +28,12 @@ class Trainer(Protocol):
     flights: RealFlights
     config: TwinningConfig
     belief: Belief
-    virtual: VirtualEpisodes
+    short_term: ShortTermMemory
+    judged: int
 
     @property
-    def judged(self) -> int:
-        """Number of virtual episodes on which policies are judged."""
-
-    def keep(self, flight: Flight) -> None:
-        """Give a flight to both memories."""
+    def virtual(self) -> VirtualEpisodes:
+        """Virtual episodes of the twin."""
 
 
 class Operating:
@@ -66,7 +66,7 @@ class Operating:
         strength = self._exploration.strength(episode)
         self.operation.hand_over(role, policy, strength=strength, found=plain(report))
 
-    def take(self, live: Role, episode: int) -> TensorDict:
+    def take(self, live: Role, episode: int) -> tuple[Sequence[Flight], TensorDict]:
         """Take every window that has come in; wait until one is of a policy.
 
         Args:
@@ -74,7 +74,8 @@ class Operating:
             episode: number of the learner's episode, from 0; before the first one nothing was handed over.
 
         Returns:
-            ``real_cost``, the mean J_a of the ``windows``, and what was measured of the control intervals.
+            The windows, oldest first; ``real_cost``, the mean J_a of the ``windows``, and what was measured of the
+            control intervals.
         """
         if episode == 0:
             self.hand_over(live, 0)
@@ -83,13 +84,13 @@ class Operating:
             if flights and flights[-1].whole and self.trainer.config.arm != "model_free":
                 self.trainer.virtual.learn(flights[-1].record)  # step 3 fits the last one
             flight = self._taken()
-            self.trainer.keep(flight)
+            self.trainer.short_term.append(flight.record)
             flights.append(flight)
             order = self._order_of(flight)
             if order.name != FIRST:
                 policy_flew = True
                 self._note(flight, order)
-        return self._report(flights)
+        return flights, self._report(flights)
 
     def _taken(self) -> Flight:
         needed = self.trainer.virtual.wanting(self.trainer.config.arm)

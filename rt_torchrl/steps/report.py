@@ -1,12 +1,47 @@
-"""The report of an episode: scalars by name, the policy that acted, the event, and the reasons for refusals."""
+"""A step of the algorithm, the report of an episode, and the state and the architecture of parts."""
 
 import math
 from collections.abc import Mapping
 from functools import partial
+from typing import Any, TypeVar
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map_only
+
+Report = TypeVar("Report", bound=TensorDictBase)
+
+
+class Step(TensorDictModuleBase):
+    """A step of the algorithm: it reads ``in_keys`` of the episode, writes ``out_keys`` and what it reports.
+
+    Args:
+        parts: what lasts from episode to episode and belongs to this step, by the name that a user knows it by. Each
+            has ``state_dict`` and ``load_state_dict``.
+    """
+
+    def __init__(self, **parts: Any):
+        super().__init__()
+        self.parts = parts
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The state of every part, in tensors and plain containers."""
+        return {name: part.state_dict() for name, part in self.parts.items()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Give every part its state.
+
+        Raises:
+            ValueError: if a state does not fit its part, with the name of the part.
+        """
+        for name, part in self.parts.items():
+            try:
+                part.load_state_dict(state[name])
+            # Torch, tensordict and environments each have errors of their own for what does not fit.
+            except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+                raise ValueError(f"the saved state of {name} does not fit: {error}") from error
 
 
 def findings(*reasons: str, **values: float | Tensor | str) -> TensorDict:
@@ -36,7 +71,7 @@ def as_findings(entries: Mapping[str, float | str]) -> TensorDict:
     return findings(**entries)
 
 
-def merged(report: TensorDict, other: TensorDict) -> TensorDict:
+def merged(report: Report, other: TensorDictBase) -> Report:
     """The report with the entries of ``other`` added; the reasons of both stay."""
     reasons = [part["reason"] for part in (report, other) if "reason" in part]
     report.update(other)
@@ -81,3 +116,28 @@ def weight_change(module: nn.Module, earlier: Tensor) -> Tensor:
     """The relative change ‖w − w_earlier‖/‖w‖ of a module's weights since they were the vector ``earlier``."""
     now = weight_vector(module)
     return (now - earlier).norm() / now.norm()
+
+
+def same_architecture(first: nn.Module, second: nn.Module) -> bool:
+    """Whether two modules with the same weights are the same function: same submodules, settings and weight shapes.
+
+    Shapes alone do not tell: perceptrons with different activations have weights of the same shapes.
+    """
+    return _structure(first) == _structure(second)
+
+
+def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
+    """Class and settings of every submodule, and the shapes of what its state dict holds."""
+    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
+    return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
+
+
+def _settings(module: nn.Module) -> dict[str, Any]:
+    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
+    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
+    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}
+
+
+def on_device(state: dict[str, Any], device: torch.device) -> dict[str, Any]:
+    """The state with all its tensors on a device."""
+    return tree_map_only(Tensor, lambda tensor: tensor.to(device), state)

@@ -1,0 +1,351 @@
+r"""Reinforcement Twinning: the paper's algorithm as a sequence of six TensorDict modules.
+
+There are two policies of the same observation, π_mf (model-free) and π_mb (model-based). One is live: it acts on the
+real system. The other is idle: it learns at the same time and can take over. One TensorDict, the episode, flows through
+the steps:
+
+| key | shape, unit | written by | read by |
+|---|---|---|---|
+| ``number`` | number of the episode, from 0 | the algorithm | 1, 5 |
+| ``live`` | role of the policy that acts | the algorithm, 1 | 1 |
+| ``record/states``, ``actions``, ``exogenous``, ``start`` | n+1 × n_s, n × n_a, n × n_z, [s] | 1 | 3, 4, 6 |
+| ``transitions/k`` | n_k transitions of each sound part | 1 | 2 |
+| ``real_cost`` | J_a as measured | 1 | |
+| ``weight_changes/model_free``, ``/model_based`` | relative change ‖Δw‖/‖w‖ | 2, 5 | 6 |
+| ``large_scale`` | n × n_z, units of the inputs | 3 | 4, 5 |
+| ``J_p_before``, ``J_p`` | cost of the twin on the records | 4 | 5 |
+| ``J_a_plan_before``, ``J_a_plan`` | mean J_a of the plan on its virtual episodes | 5 | |
+| ``event`` | keep, swap or clone | 6 | |
+| ``J_a_model_based``, ``J_a_model_free`` | mean J_a on the twin | 6 | |
+| ``seconds/STEP`` | wall time [s] | the algorithm | |
+
+and what each step reports beside. What lasts between episodes belongs to the steps, whose ``state_dict`` has it.
+"""
+
+import copy
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import nn
+from torchrl.envs import EnvBase
+
+from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.interruption import safe_point
+from rt_torchrl.steps.assimilate import Assimilate
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
+from rt_torchrl.steps.interact import Interact
+from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
+from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
+from rt_torchrl.steps.report import EpisodeReport, findings, merged, on_device
+from rt_torchrl.steps.start import Start, first_live
+from rt_torchrl.steps.switch import Referee, Switch, make_referee
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
+from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.operation.operation import Operation, system_of
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import batch_of
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation
+from rt_torchrl.twinning.clearance import Clearance
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.flight import RealFlights
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation
+from rt_torchrl.twinning.operating import Operating
+from rt_torchrl.twinning.short_term_memory import ShortTermMemory
+
+ARMS = {
+    "twinning": ("interact", "learn", "inputs", "assimilate", "plan", "switch"),
+    "model_free": ("interact", "learn"),
+    "model_based": ("interact", "inputs", "assimilate", "plan"),
+}
+"""Steps of each arm, in their order."""
+
+
+class ReinforcementTwinning(TensorDictSequential):
+    """The algorithm; call :meth:`episode` once per real episode.
+
+    A step of one's own, any TensorDict module, goes in by :meth:`insert` and takes the place of another one by
+    ``algorithm.module["plan"] = ...``.
+
+    Args:
+        env: the real system, of batch size 1: :class:`PlantEnv`, :class:`RealSystem`, or an :class:`Operation` of one.
+        twin: the digital twin, whose closure is trained in place.
+        model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based`` or with ``first``.
+        model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
+        config: hyper-parameters of the six steps.
+        generator: source of all random numbers that the real system does not draw itself.
+        learner: learner of step 2, which trains ``model_free``; by default that of ``config.learner``.
+        planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
+        referee: referee of step 6; by default that of ``config.referee``.
+        first: what is known beforehand, such as :class:`FirstController`; None begins with the policies as they are.
+        make_policy: function that draws a random policy like ``model_based``; by default that of the plant.
+
+    Raises:
+        ValueError: if the real system's batch size is not 1, or learner or planner train other policies.
+    """
+
+    module: nn.ModuleDict
+    env: EnvBase | Operation
+    twin: DigitalTwin
+    config: TwinningConfig
+    generator: torch.Generator
+    first: Start | None
+    policies: dict[Role, nn.Module]
+    learner: Learner
+    planner: Planner
+    referee: Referee
+    virtual: VirtualEpisodes
+    belief: Belief
+    flights: RealFlights
+    actor: LivePolicy
+    collector: Operation | EpisodeCollector | FlightCollector
+    clearance: Clearance
+    assimilation: Assimilation
+    planning: MultiStart
+    imitation: Imitation
+    short_term: ShortTermMemory
+    operating: Operating | None
+    steps: dict[str, Any]
+
+    def __init__(
+        self,
+        env: EnvBase | Operation,
+        twin: DigitalTwin,
+        *,
+        model_free: nn.Module,
+        model_based: nn.Module,
+        config: TwinningConfig,
+        generator: torch.Generator,
+        learner: Learner | None = None,
+        planner: Planner | None = None,
+        referee: Referee | None = None,
+        first: Start | None = None,
+        make_policy: Callable[[torch.Generator], nn.Module] | None = None,
+    ):
+        policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
+        learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
+        planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
+        referee = referee or make_referee(config.referee, first_live(config.arm, first))
+        halves: dict[Role, Learner | Planner] = {"model_free": learner, "model_based": planner}
+        for role, half in halves.items():
+            if half.policy is not policies[role]:
+                raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
+        share_critic(learner, model_based)
+        fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
+        judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
+        virtual = VirtualEpisodes(
+            twin,
+            config.exogenous,
+            config.experience,
+            constraints=getattr(planner, "constraints", None),
+            extremes=0 if fed_back else config.planner.extremes,
+            generator=generator,
+        )
+        corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
+        belief, system = Belief(policies, virtual, corrects=corrects), system_of(env)
+        actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)
+        collector = env if isinstance(env, Operation) else collector_of(env, actor, twin.plant)
+        flights = RealFlights(env, actor, lambda: collector.rollout(), twin.plant, config.least_sound)
+        clearance = Clearance(system, policies, virtual, config.limits)
+        interact = Interact(env, policies, flights, clearance, belief, config, judged)
+        assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
+        planning, imitation = MultiStart(planner, belief, config.planner, make_policy), Imitation(belief, judged)
+        count = config.planner.realisations or config.realisations
+        steps: dict[str, TensorDictModuleBase] = {
+            "interact": interact,
+            "learn": Learn(learner, belief, judged),
+            "inputs": FitInputs(virtual, flights),
+            "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
+            "plan": MakePlan(planning, count, judged),
+            "switch": Switch(referee, policies, belief, imitation, halves, learner.observations, judged),
+        }
+        super().__init__(OrderedDict((name, steps[name]) for name in ARMS[config.arm]))
+        self.closure, self.model_free, self.model_based = twin.closure, model_free, model_based
+        # These are no sub-modules: what lasts of them belongs to the steps.
+        self.__dict__.update(
+            env=env,
+            twin=twin,
+            config=config,
+            generator=generator,
+            first=first,
+            policies=policies,
+            learner=learner,
+            planner=planner,
+            referee=referee,
+            virtual=virtual,
+            belief=belief,
+            flights=flights,
+            actor=actor,
+            collector=collector,
+            clearance=clearance,
+            assimilation=assimilation,
+            planning=planning,
+            imitation=imitation,
+            short_term=interact.short_term,
+            operating=interact.operating,
+            steps=steps,
+        )
+        self.episodes_done = 0
+
+    def insert(self, name: str, step: TensorDictModuleBase, *, before: str) -> None:
+        """Insert a step of one's own.
+
+        Args:
+            name: name of the step, under which its seconds are reported.
+            step: the step, a TensorDict module.
+            before: name of the step that it comes before.
+
+        Raises:
+            ValueError: if there is no such step.
+        """
+        if before not in self.module:
+            raise ValueError(f"before={before!r} is no step of this arm; choose one of {', '.join(self.module)}.")
+        old, self.module = dict(self.module.items()), nn.ModuleDict()
+        for known, module in old.items():
+            if known == before:
+                self.module[name] = step
+            self.module[known] = module
+
+    def episode(self, tell: Callable[[str], None] = lambda step: None) -> EpisodeReport:
+        """Fly one real episode and learn from it: the steps of the arm, in their order.
+
+        Args:
+            tell: function that is called with the name of every step when the step begins.
+
+        Returns:
+            ``real_cost``, ``live``, what the steps of this arm report, and the ``seconds`` of each step.
+        """
+        flown = self(TensorDict({"number": self.episodes_done}), tell=tell)
+        self.episodes_done += 1
+        if self.operating:
+            self.operating.hand_over(self.referee.live, self.episodes_done)
+        return EpisodeReport(flown.exclude("number", "record", "transitions", "large_scale", "weight_changes"))
+
+    def forward(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda step: None) -> TensorDictBase:
+        """Let an episode flow through the steps, after the start before the first one; see :meth:`episode`."""
+        if "live" not in episode:
+            episode.set_non_tensor("live", self.referee.live)
+        begins = {"start": self.start} if self.first is not None and not self.episodes_done else {}
+        for name, step in {**begins, **self.module}.items():
+            safe_point()
+            tell(name)
+            start = time.perf_counter()
+            episode = self._sound(step, episode) if name in ("plan", "switch") else step(episode)
+            episode["seconds", name] = time.perf_counter() - start
+        return episode
+
+    def start(self, episode: TensorDictBase | None = None) -> TensorDictBase:
+        """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
+        assert self.first is not None
+        episode = TensorDict() if episode is None else episode
+        pupils = self.first.take(self.policies, self.twin.closure)
+        self.assimilation.begin()
+        for half in (self.learner, self.planner):
+            half.restart()
+        if not pupils:
+            return episode
+        self.flights.begin()
+        flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
+        on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
+        for flight in flights:
+            self.steps["learn"].store(flight.parts(self.twin.plant.dt))
+            self.short_term.append(flight.record)
+            if on_twin:
+                self.virtual.learn(flight.record)
+        if on_twin:
+            self.steps["assimilate"].fit(records)
+            self.assimilation.explain(self.belief.replayed(records), self.generator)
+            if "model_based" in pupils:
+                self.planning.remember()
+        imitating = {role: self.policies[role] for role in pupils}
+        found = self.imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
+        if len(records[-1].actions) != self.twin.plant.n_steps:
+            self.short_term.clear()  # later records are whole episodes
+            self.virtual.processes.clear()
+        start_cost = torch.stack([flight.cost for flight in flights]).mean()
+        return merged(merged(episode, found), findings(start_cost=start_cost))
+
+    def _sound(self, step: Callable[[TensorDictBase], TensorDictBase], episode: TensorDictBase) -> TensorDictBase:
+        """Take a step that relies on the twin; the one rollback of the algorithm.
+
+        The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
+        must be wrong, and the step is repeated with the closure of the last episode, then with the first one. Any other
+        policy may diverge on a sound twin, and loses. Where it diverges with the first closure too, the step is left
+        out: the real system goes on. Note: the paper keeps every closure.
+
+        An interrupt or another error gives π_mb its weights back: it may have those of half a plan.
+        """
+        policy, state = copy.deepcopy(self.model_based.state_dict()), self.generator.get_state()
+        kept = [self.steps["assimilate"].closure_before, self.assimilation.first]
+        closures, reasons = [closure for closure in kept if closure is not None], list[str]()
+        try:
+            while True:
+                try:
+                    taken = step(episode)
+                    return merged(taken, findings(*reasons, closure_refused=1.0)) if reasons else taken
+                except DivergenceError as error:
+                    if not closures:
+                        return self._left_out(episode, policy, reasons, str(error))
+                    reasons = reasons or [f"closure refused: {error}"]
+                self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
+                self.twin.closure.load_state_dict(closures.pop(0))
+                self.steps["assimilate"].closure_before = None
+                self.twin.retreat()
+                self.generator.set_state(state)
+                self.planner.restart()
+        except BaseException:
+            self.model_based.load_state_dict(policy)
+            raise
+
+    def _left_out(
+        self, episode: TensorDictBase, policy: dict[str, Any], reasons: list[str], error: str
+    ) -> TensorDictBase:
+        """The episode without a step in which the twin diverges with every closure."""
+        self.model_based.load_state_dict(policy)
+        report = findings(*reasons, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
+        report.set_non_tensor("warning", f"the twin diverges under a policy that has flown: {error}")
+        return merged(episode, report)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What the next episode depends on beside policies, closure and the state of the steps."""
+        return {"episodes_done": self.episodes_done, "generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.episodes_done = state["episodes_done"]
+        self.generator.set_state(state["generator"].cpu())
+
+    def load_state_dict(self, state: dict[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Go on from the :meth:`state_dict` of an algorithm that was built with the same arguments.
+
+        Raises:
+            ValueError: if the state of a part does not fit; it names the part.
+        """
+        try:
+            return super().load_state_dict(on_device(state, self.generator.device), strict, assign)
+        except RuntimeError as error:
+            raise ValueError(f"the saved state of policies or closure does not fit: {error}") from error
+
+
+def share_critic(learner: object, policy: nn.Module) -> None:
+    """Give model predictive control the cost-to-go of the model-free half, if it is to price the end of its windows.
+
+    Raises:
+        ValueError: if the learner has no method ``cost_to_go``.
+    """
+    if isinstance(policy, PredictiveControl) and policy.terminal == "critic":
+        cost_to_go = getattr(learner, "cost_to_go", None)
+        if cost_to_go is None:
+            raise ValueError(
+                f"terminal='critic' of the receding horizon needs a learner with a method cost_to_go(observation); "
+                f"{type(learner).__name__} has none. Use terminal plant."
+            )
+        policy.value = cost_to_go
