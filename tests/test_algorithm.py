@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
+from torch import nn
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
@@ -58,6 +59,11 @@ def scripted(found, live, idle):
 @pytest.mark.parametrize(
     "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:6]])]
 )
+def critics(found):
+    """The weights of the learner's critics, as a module."""
+    return nn.ParameterList(found.learner.critic_adam.weights)
+
+
 def test_steps_come_in_order(arm, expected):
     found, calls = twinning(arm=arm), []
 
@@ -92,14 +98,14 @@ def test_arms_touch_their_own_half_alone():
     for arm, moved in (("model_free", "model_free"), ("model_based", "model_based")):
         found = twinning(arm=arm)
         before = {role: weights(policy) for role, policy in found.policies.items()}
-        closure, critic = weights(found.twin.closure), weights(found.learner.critic)
+        closure, critic = weights(found.twin.closure), weights(critics(found))
         for _ in range(2):
             found.episode()
         assert found.referee.live == arm and found.actor.policy is found.policies[arm]
         for role, policy in found.policies.items():
             assert torch.equal(before[role], weights(policy)) == (role != moved)
         assert torch.equal(closure, weights(found.twin.closure)) == (arm == "model_free")
-        assert torch.equal(critic, weights(found.learner.critic)) == (arm == "model_based")
+        assert torch.equal(critic, weights(critics(found))) == (arm == "model_based")
 
 
 def test_what_is_stored_is_what_was_applied():
@@ -208,7 +214,7 @@ def test_same_seeds_repeat_and_others_do_not():
         torch.manual_seed(np.random.default_rng().integers(2**31))
         found = twinning(**seeds)
         costs = [found.episode()["real_cost"] for _ in range(3)]
-        modules = [found.twin.closure, *found.policies.values(), found.learner.critic]
+        modules = [found.twin.closure, *found.policies.values(), critics(found)]
         return torch.cat([torch.stack(costs), *map(weights, modules)])
 
     first = run(seed=1, env_seed=1)
