@@ -6,6 +6,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from printed_commands import documented
 from tensordict import TensorDict
+from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -57,6 +58,11 @@ def weights(module):
     return torch.cat([w.detach().flatten() for w in module.parameters()]).clone()
 
 
+def critics(found):
+    """The weights of the learner's critics, as a module."""
+    return nn.ParameterList(found.learner.critic_adam.weights)
+
+
 def scripted(found, live, idle):
     """Make step 6 compare these costs."""
     costs = {found.policies[found.referee.live]: live, found.policies[found.referee.idle]: idle}
@@ -94,14 +100,14 @@ def test_arms_touch_their_own_half_alone():
     for arm, moved in (("model_free", "model_free"), ("model_based", "model_based")):
         found = twinning(arm=arm)
         before = {role: weights(policy) for role, policy in found.policies.items()}
-        closure, critic = weights(found.twin.closure), weights(found.learner.critic)
+        closure, critic = weights(found.twin.closure), weights(critics(found))
         for _ in range(2):
             found.episode()
         assert found.referee.live == arm and found.actor.policy is found.policies[arm]
         for role, policy in found.policies.items():
             assert torch.equal(before[role], weights(policy)) == (role != moved)
         assert torch.equal(closure, weights(found.twin.closure)) == (arm == "model_free")
-        assert torch.equal(critic, weights(found.learner.critic)) == (arm == "model_based")
+        assert torch.equal(critic, weights(critics(found))) == (arm == "model_based")
 
 
 def test_what_is_stored_is_what_was_applied():
@@ -208,7 +214,7 @@ def test_same_seeds_repeat_and_others_do_not():
         torch.manual_seed(np.random.default_rng().integers(2**31))
         found = twinning(**seeds)
         costs = [found.episode()["real_cost"] for _ in range(3)]
-        modules = [found.twin.closure, *found.policies.values(), found.learner.critic]
+        modules = [found.twin.closure, *found.policies.values(), critics(found)]
         return torch.cat([torch.stack(costs), *map(weights, modules)])
 
     first = run(seed=1, env_seed=1)

@@ -3,7 +3,7 @@
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable  # noqa: TC003  (run-time checks read it)
 from pathlib import Path
 from typing import Literal
 

@@ -114,7 +114,9 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
     def make(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
         n_a = cast(ProbabilisticActor, actor).spec["action"].shape[-1]
         options = {"num_qvalue_nets": len(critics), "loss_function": "l2", "target_entropy": -float(n_a)}
-        return loss(actor, critics, alpha_init=0.1, **options)
+        made = loss(actor, critics, alpha_init=0.1, **options)
+        float(made.target_entropy)  # REDQ registers it when it is first read, too late for a state that is loaded
+        return made
 
     return make
 
