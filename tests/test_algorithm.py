@@ -116,7 +116,7 @@ def test_what_is_stored_is_what_was_applied():
     rollouts = []
     fly = found.collector.rollout
     found.collector.rollout = lambda: rollouts.append(fly()) or rollouts[-1]
-    flown(found)
+    found.steps["learn"].store(flown(found)["transitions"].values())
     (record,) = found.short_term
     (commands,) = rollouts[-1]["action"]
     stored = found.learner.memory.buffer[:60]
@@ -150,6 +150,7 @@ def test_record_and_transitions_are_those_of_the_episode():
     found = twinning(records=2)
     for _ in range(3):
         report = flown(found)
+        found.steps["learn"].store(report["transitions"].values())
     assert len(found.short_term) == 2 and len(found.learner.memory) == 60
     record, last = found.short_term[-1], found.learner.memory.buffer[40:60]
     # On this plant the observation is the state.
