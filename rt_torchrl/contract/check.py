@@ -136,7 +136,8 @@ def _on_flights(
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
-    calls.closure.requires_grad_(trained)
+    if not trained:
+        calls.closure.requires_grad_(False)
     return [text for check in (*checks, judgement) for text in attempt(check, calls)]
 
 

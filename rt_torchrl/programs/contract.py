@@ -27,7 +27,7 @@ import types
 from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import chain, repeat
+from itertools import chain
 from operator import methodcaller
 from typing import Any, NamedTuple
 
@@ -96,7 +96,7 @@ class Compared:
     """What is compared with what it was: objects by identity, numbers of tensors and arrays by value."""
 
     def __init__(self) -> None:
-        self.mappings, self.sequences = list[Any](), list[Any]()
+        self.mappings, self.sequences, self.instances = list[Any](), list[Any](), list[Any]()
         self.entries, self.parts = list[tuple[dict[str, Any], str]](), list[tuple[Any, str]]()
         self.tensors, self.constants = list[Tensor](), list[Any]()
         """Tensors in their memory, and tensors and arrays with their numbers."""
@@ -109,11 +109,12 @@ class Compared:
         self._then, self._numbers_then = self._objects(), self._numbers()
         self._addresses = self._then.tobytes()
 
-    def _objects(self) -> np.ndarray:
+    def _objects(self, count: int = -1) -> np.ndarray:
         """All objects; as long as the array lives, no other object takes their addresses."""
         containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
-        parts = map(getattr, *self._parts, repeat(MISSING))
-        return np.fromiter(chain(chain.from_iterable(containers), map(dict.get, *self._entries), parts), object)
+        kinds, dicts = map(type, self.instances), map(vars, self.instances)
+        others = chain(kinds, dicts, map(dict.get, *self._entries), map(getattr, *self._parts))
+        return np.fromiter(chain(chain.from_iterable(containers), others), object, count)
 
     def _numbers(self) -> list[object]:
         sizes = map(len, chain(self.mappings, self.sequences))
@@ -123,11 +124,11 @@ class Compared:
         """Whether everything is as it was."""
         try:
             return (
-                self._objects().tobytes() == self._addresses
+                self._numbers() == self._numbers_then
                 and all(map(Tensor.is_set_to, self.tensors, self._views))
-                and self._numbers() == self._numbers_then
+                and self._objects(len(self._then)).tobytes() == self._addresses
             )
-        except (ValueError, RuntimeError):  # a variable has lost its value, or a tensor has another type
+        except (AttributeError, ValueError, RuntimeError):  # a value is lost, or a tensor has another type
             return False
 
 
@@ -189,15 +190,14 @@ class Holdings(Compared):
         else:
             self.sequences += [x] if isinstance(x, SEQUENCES) else []
             held = [*x] if isinstance(x, (*SEQUENCES, tuple, frozenset)) else []
-        names = _parts_of(x)
-        self.parts += [(x, name) for name in names]
-        try:
-            held += [getattr(x, name, None) for name in names]
-        except ValueError:  # a variable without a value, which may get one
-            self._complete = False
+        for name in _parts_of(x):
+            try:
+                held.append(getattr(x, name))
+                self.parts.append((x, name))
+            except (AttributeError, ValueError):  # a slot or a variable without a value, which may get one
+                self._complete = False
         if hasattr(x, "__dict__"):
-            if self._numbered[id(x)]:  # all but the root
-                self.parts += [(x, "__class__"), (x, "__dict__")]
+            self.instances += [x] if self._numbered[id(x)] else []  # all but the root
             self.mappings.append(vars(x))
             held += [*vars(x), *vars(x).values()]
         elif not held and not isinstance(x, (*MAPPINGS, *SEQUENCES, tuple, frozenset)):
@@ -206,7 +206,7 @@ class Holdings(Compared):
 
     def _read_numbers(self, x: Any) -> list[object]:
         """Type and shape of a tensor or an array, and its numbers unless they are an input."""
-        description = [type(x).__name__, tuple(x.shape), str(x.dtype)]
+        description: list[object] = [type(x).__name__, tuple(x.shape), str(x.dtype)]
         if isinstance(x, Tensor):
             description.append(x.requires_grad)
             if x.layout is not torch.strided or x.device.type != "cpu":
@@ -256,7 +256,7 @@ class Outside(Compared):
         new = kind not in self._kinds
         if new:
             self._kinds.add(kind)
-            self.mappings.append(vars(kind))
+            self.sequences.append(vars(kind).values())
             self.parts.append((kind, "__mro__"))
         return new
 
