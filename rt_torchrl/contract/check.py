@@ -5,10 +5,9 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-from rt_torchrl.contract.draws import draws, modules, signals
+from rt_torchrl.contract.draws import draws, misshapen, modules, seeded, signals, wanted_as
 from rt_torchrl.contract.gradients_and_tracing import (
     first_line,
     forward_mode,
@@ -136,7 +135,8 @@ def _on_flights(
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
-    calls.closure.requires_grad_(trained)
+    if not trained:
+        calls.closure.requires_grad_(False)
     return [text for check in (*checks, judgement) for text in attempt(check, calls)]
 
 
@@ -178,8 +178,7 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
         given = f"the class {law.__name__}" if isinstance(law, type) else f"an instance of {type(law).__name__}"
         instead = f"its class, {type(law).__name__}" if isinstance(law, ClassicalController) else "a subclass of it"
         raise ValueError(f"{name}, {given}, must be a class derived from ClassicalController; give {instead}.")
-    controller, generator = law(plant), torch.Generator().manual_seed(0)
-    state = plant.draw_initial_state(STATES, generator)[:, : len(plant.readings)]
+    controller, state = law(plant), plant.draw_initial_state(STATES, seeded(0))[:, : len(plant.readings)]
     size, about = controller.memory_size, f"{name}: {law.__name__}"
     memory = controller.first_memory(state)
     _require(f"{about}.first_memory returns", memory, size, f"memory_size={size}")
@@ -188,7 +187,7 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
     except (IndexError, RuntimeError) as error:
         raise ValueError(
             f"{about}.law fails for states of shape {tuple(state.shape)} and a memory of shape {tuple(memory.shape)}: "
-            f"{str(error).splitlines()[0]}. Its memory has as many columns as memory_size={size} says."
+            f"{first_line(error)}. Its memory has as many columns as memory_size={size} says."
         ) from error
     if not (isinstance(found, tuple) and len(found) == 2):
         raise ValueError(f"{about}.law returns {type(found).__name__}; give both: return command, memory.")
@@ -197,16 +196,14 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
     _require(f"{about}.law returns a memory,", found[1], size, f"memory_size={size}")
 
 
-def _require(about: str, found: object, columns: int, why: str) -> None:
+def _require(about: str, value: object, columns: int, why: str) -> None:
     """Refuse what is no finite tensor of a batch with so many columns in double precision."""
-    given = f"{tuple(found.shape)} in {found.dtype}" if isinstance(found, Tensor) else type(found).__name__
-    if not isinstance(found, Tensor) or tuple(found.shape) != (STATES, columns) or found.dtype != torch.float64:
+    shape = (STATES, columns)
+    if problem := misshapen(value, shape):
         raise ValueError(
-            f"{about} {given} for {STATES} states; expected shape {(STATES, columns)} in torch.float64 ({why}). A "
-            "column is state[:, :1], not state[:, 0]."
+            f"{about} {problem} for {STATES} states; expected {wanted_as(shape)} ({why}). A column is state[:, :1], "
+            "not state[:, 0]."
         )
-    if not found.isfinite().all():
-        raise ValueError(f"{about} numbers that are not finite for states that the plant draws.")
 
 
 ON_FLIGHTS: dict[str, Check] = {

@@ -27,7 +27,7 @@ import types
 from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import chain, repeat
+from itertools import chain
 from operator import methodcaller
 from typing import Any, NamedTuple
 
@@ -54,6 +54,11 @@ CHANGING = (
 """Types of libraries whose objects hold what may change."""
 REPLACED = (type, enum.Enum, types.ModuleType, types.FunctionType, staticmethod, classmethod, property)
 """Types of objects that hold nothing, or what is judged by itself."""
+WRAPPERS = (
+    *(types.FunctionType, types.MethodType, staticmethod, classmethod, property),
+    *(functools.partial, type(lru_cache(max))),
+)
+"""Types of functions and of what holds one."""
 MAPPINGS, SEQUENCES = (dict, types.MappingProxyType), (list, set, collections.deque, bytearray)
 PARTS = {
     types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"),
@@ -87,11 +92,11 @@ def inputs_of(module: nn.Module) -> dict[str, Tensor]:
     return dict(module.named_parameters()) | buffers
 
 
-class Places:
-    """Places of objects, which are compared by identity, and of numbers, which are compared by value."""
+class Compared:
+    """What is compared with what it was: objects by identity, numbers of tensors and arrays by value."""
 
     def __init__(self) -> None:
-        self.mappings, self.sequences = list[Any](), list[Any]()
+        self.mappings, self.sequences, self.instances = list[Any](), list[Any](), list[Any]()
         self.entries, self.parts = list[tuple[dict[str, Any], str]](), list[tuple[Any, str]]()
         self.tensors, self.constants = list[Tensor](), list[Any]()
         """Tensors in their memory, and tensors and arrays with their numbers."""
@@ -104,11 +109,12 @@ class Places:
         self._then, self._numbers_then = self._objects(), self._numbers()
         self._addresses = self._then.tobytes()
 
-    def _objects(self) -> np.ndarray:
+    def _objects(self, count: int = -1) -> np.ndarray:
         """All objects; as long as the array lives, no other object takes their addresses."""
         containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
-        parts = map(getattr, *self._parts, repeat(MISSING))
-        return np.fromiter(chain(chain.from_iterable(containers), map(dict.get, *self._entries), parts), object)
+        kinds, dicts = map(type, self.instances), map(vars, self.instances)
+        others = chain(kinds, dicts, map(dict.get, *self._entries), map(getattr, *self._parts))
+        return np.fromiter(chain(chain.from_iterable(containers), others), object, count)
 
     def _numbers(self) -> list[object]:
         sizes = map(len, chain(self.mappings, self.sequences))
@@ -118,15 +124,15 @@ class Places:
         """Whether everything is as it was."""
         try:
             return (
-                self._objects().tobytes() == self._addresses
+                self._numbers() == self._numbers_then
                 and all(map(Tensor.is_set_to, self.tensors, self._views))
-                and self._numbers() == self._numbers_then
+                and self._objects(len(self._then)).tobytes() == self._addresses
             )
-        except (ValueError, RuntimeError):  # a variable has lost its value, or a tensor has another type
+        except (AttributeError, ValueError, RuntimeError):  # a value is lost, or a tensor has another type
             return False
 
 
-class Holdings(Places):
+class Holdings(Compared):
     """What a module and everything in its attributes hold, by value.
 
     ``digest`` is equal where one machine code serves. :meth:`unchanged` compares all objects with those of before by
@@ -184,15 +190,14 @@ class Holdings(Places):
         else:
             self.sequences += [x] if isinstance(x, SEQUENCES) else []
             held = [*x] if isinstance(x, (*SEQUENCES, tuple, frozenset)) else []
-        names = _parts_of(x)
-        self.parts += [(x, name) for name in names]
-        try:
-            held += [getattr(x, name, None) for name in names]
-        except ValueError:  # a variable without a value, which may get one
-            self._complete = False
+        for name in _parts_of(x):
+            try:
+                held.append(getattr(x, name))
+                self.parts.append((x, name))
+            except (AttributeError, ValueError):  # a slot or a variable without a value, which may get one
+                self._complete = False
         if hasattr(x, "__dict__"):
-            if self._numbered[id(x)]:  # all but the root
-                self.parts += [(x, "__class__"), (x, "__dict__")]
+            self.instances += [x] if self._numbered[id(x)] else []  # all but the root
             self.mappings.append(vars(x))
             held += [*vars(x), *vars(x).values()]
         elif not held and not isinstance(x, (*MAPPINGS, *SEQUENCES, tuple, frozenset)):
@@ -201,7 +206,7 @@ class Holdings(Places):
 
     def _read_numbers(self, x: Any) -> list[object]:
         """Type and shape of a tensor or an array, and its numbers unless they are an input."""
-        description = [type(x).__name__, tuple(x.shape), str(x.dtype)]
+        description: list[object] = [type(x).__name__, tuple(x.shape), str(x.dtype)]
         if isinstance(x, Tensor):
             description.append(x.requires_grad)
             if x.layout is not torch.strided or x.device.type != "cpu":
@@ -238,7 +243,7 @@ def _bytes(x: Any) -> bytes:
     return repr((x.shape, x.dtype)).encode() + x.tobytes()
 
 
-class Outside(Places):
+class Outside(Compared):
     """Constants outside of a module, which can only be replaced, and classes."""
 
     def __init__(self) -> None:
@@ -251,7 +256,7 @@ class Outside(Places):
         new = kind not in self._kinds
         if new:
             self._kinds.add(kind)
-            self.mappings.append(vars(kind))
+            self.sequences.append(vars(kind).values())
             self.parts.append((kind, "__mro__"))
         return new
 
@@ -353,7 +358,7 @@ class _Reads:
             self.outside.constants += [value] if followed else []
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
-            for attribute in attributes & (further if isinstance(further, dict) else vars(further)).keys():
+            for attribute in attributes & vars(further).keys():
                 if not (seen and (id(further), attribute) in self._judged):
                     self._take(code, further, attribute, f"{inner}.")
 
@@ -382,22 +387,22 @@ class _Reads:
             self.outside.parts += [(cell, "cell_contents") for cell in cells]
 
     def _note_function(self, x: object) -> None:
-        """Note a function, and those that it wraps."""
-        f = _function_of(x)
-        if f is None or foreign(f.__globals__.get("__name__")) or f in self._functions[f.__code__]:
+        """Note a function, those that it wraps, and those in variables around it."""
+        if not isinstance(x, WRAPPERS):
             return
-        self._functions[f.__code__].append(f)
-        self._note_function(getattr(f, "__wrapped__", None))
-        for cell in f.__closure__ or ():
-            if cell != types.CellType():
-                self._note_function(cell.cell_contents)
+        if isinstance(x, types.FunctionType):
+            if foreign(x.__globals__.get("__name__")) or x in self._functions[x.__code__]:
+                return
+            self._functions[x.__code__].append(x)
+            for cell in x.__closure__ or ():
+                self._note_function(cell.cell_contents if cell != types.CellType() else None)
+        for name in ("fget", "func", "__func__", "__wrapped__"):
+            self._note_function(getattr(x, name, None))
 
     def _constant(self, value: object) -> bool:
         """Whether a value can only be replaced; functions count, because what they read is judged itself."""
         kind = type(value)
-        if isinstance(
-            value, (type, types.ModuleType, types.FunctionType, enum.Enum, staticmethod, classmethod, property)
-        ):
+        if isinstance(value, REPLACED):
             return True
         if isinstance(value, (tuple, frozenset)):
             return all(map(self._constant, (*value, *getattr(value, "__dict__", {}).values())))
@@ -436,24 +441,11 @@ def _names(code: types.CodeType) -> _Names:
 
 def _holders(value: object) -> Iterator[Any]:
     """Where attributes of a value are found that nothing else notices."""
-    if isinstance(value, types.ModuleType):
-        if not foreign(value.__name__):
-            yield vars(value)
-    elif isinstance(value, type):
-        yield from (kind for kind in value.__mro__ if not foreign(kind.__module__))
-    elif isinstance(value, types.FunctionType):
-        if not foreign(value.__globals__.get("__name__")):
-            yield vars(value)
-    elif not foreign(type(value).__module__):
-        yield from _holders(type(value))
-
-
-def _function_of(x: Any) -> types.FunctionType | None:
-    """The function behind an attribute of a class, a bound method or a cache; None if there is none."""
-    x = x.fget if isinstance(x, property) else getattr(x, "__func__", x)
-    x = x.func if isinstance(x, functools.partial) else x
-    x = getattr(x, "__wrapped__", x) if isinstance(x, functools._lru_cache_wrapper) else x
-    return x if isinstance(x, types.FunctionType) else None
+    for x in (value, *(value if isinstance(value, type) else type(value)).__mro__):
+        if isinstance(x, (type, types.ModuleType, types.FunctionType)):
+            module = x.__name__ if isinstance(x, types.ModuleType) else x.__module__
+            if not foreign(module):
+                yield x
 
 
 def _refusal(code: types.CodeType, what: str, value: object = MISSING) -> UntraceableError:

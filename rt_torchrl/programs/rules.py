@@ -47,21 +47,13 @@ def _clamp(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
 # Sums, products and folds
 
 
-def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    cells, p = tracer.cells(args[0]), tracer.program
-    rows = _rows(cells, args[1] if len(args) > 1 else options.get("dim"))
-    m, n = rows.shape
-    if m * n > 4 * STRAIGHT:
-        ones = torch.full((n, 1), p.constant(1.0))
-        return matrix_product(tracer, rows, ones).view(out.shape)
-    found = [reduce(partial(p.apply, "add"), row) for row in rows.tolist()] if n else [p.constant(0.0)] * m
-    return in_shape(found, out.shape)
-
-
-def _fold(name: str) -> Rule:
+def _fold(name: str, empty: float = 0.0) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-        rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
-        found = [reduce(partial(tracer.program.apply, name), row) for row in rows]
+        p, rows = tracer.program, _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim"))
+        if name == "add" and rows.numel() > 4 * STRAIGHT:
+            ones = torch.full((rows.shape[1], 1), p.constant(1.0))
+            return matrix_product(tracer, rows, ones).view(out.shape)
+        found = [reduce(partial(p.apply, name), row) if row else p.constant(empty) for row in rows.tolist()]
         return in_shape(found, out.shape)
 
     return rule
@@ -267,10 +259,10 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
     "zero": lambda tracer, args, options, out: tracer.cells(0.0),
     "_to_copy": _convert,
-    "sum": _sum,
+    "sum": _fold("add"),
     "amax": _fold("maximum"),
     "amin": _fold("minimum"),
-    "prod": _fold("mul"),
+    "prod": _fold("mul", 1.0),
     "mm": lambda tracer, args, options, out: matrix_product(tracer, *map(tracer.cells, args)),
     "addmm": _addmm,
     "index": _index,
