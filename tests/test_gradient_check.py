@@ -9,7 +9,7 @@ from torch import nn
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.dashboard import Dashboard
-from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.rollout import ENGINES
 
 

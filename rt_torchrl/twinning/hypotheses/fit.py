@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.plants.neural_residual import ResidualRates
+from rt_torchrl.plants.vector_field import ResidualRates
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
