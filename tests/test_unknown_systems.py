@@ -163,7 +163,7 @@ def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixe
     ("make", "message"),
     [
         (lambda: ScaledActuator(LinearQuadratic(), "force", 0.0), "gain=0.0 of force must be positive"),
-        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind' of plant .* does not exist.*disturbance"),
+        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind'.*does not exist.*disturbance"),
         (lambda: UnreadInput(LinearQuadratic(), "disturbance", 1.0, ()), r"frequencies=\(\) .* must be positive"),
         (lambda: ScaledCoefficients(LinearQuadratic(), 0.0), "gain=0.0 of the coefficients"),
         (lambda: ScaledCoefficients(LaggedActuator(LinearQuadratic(), "force", 1.0), 0.5), "closure of the plant"),
