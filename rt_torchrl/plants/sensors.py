@@ -215,8 +215,8 @@ class StackedObservations(Extension):
         super().__init__(base, past)
         self.states = (*base.readings, *past, *base.states[self._read :])
         self.unread = base.unread
-        self.memories = tuple(signal.name for signal in past)
-        self.controller_states = (*base.controller_states, *self.memories)
+        names = tuple(signal.name for signal in past)
+        self.controller_states, self.memories = (*base.controller_states, *names), (*base.memories, *names)
         self.observations = (*base.observations, *_past(base.observations, count))
         self.observed = (*base.observed, *_past(base.observed, count))
 
