@@ -3,15 +3,15 @@
 # Plants and their parts
 from .plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
-from .plants.coefficients import LaggedCoefficients, ScaledCoefficients
+from .plants.vector_field import LaggedCoefficients, ScaledCoefficients
 from .plants.extension import ExtendedClosure, Extension
-from .plants.neural_residual import NeuralResidual
+from .plants.vector_field import NeuralResidual
 from .plants.plant import Plant, Transition
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.sampling import require_request, require_stable_step, rk4_step
 from .plants.sensors import BiasedSensor, UnreadInput
 from .plants.signal import Measurement, Named, Phase, Preview, Signal
-from .plants.stacked_observations import StackedObservations
+from .plants.sensors import StackedObservations
 from .contract import ContractReport, PlantContractError, check_plant
 from .control.classical import ClassicalController
 

@@ -18,10 +18,13 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
+from rt_torchrl.trajectories.twin import DigitalTwin, Sensitivities
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 

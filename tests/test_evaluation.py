@@ -18,7 +18,7 @@ from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.dashboard import Dashboard
-from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.rollout import ENGINES
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
-from test_sensitivity import recorded
+from test_twin import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
@@ -20,9 +20,9 @@ from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.trajectories.engines.interval import Interval
-from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise, linearise_by_rows
+from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise
 from rt_torchrl.trajectories.rollout import drive_of
-from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.trajectories.twin import DigitalTwin, jacobians_of
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "wind_turbine.py"
@@ -94,14 +94,16 @@ def test_the_tanks_coefficients_stay_within_a_factor_of_two():
 
 
 def test_jacobians_by_rows_are_those_by_columns(plant):
-    """Jacobians by reverse mode equal those by forward mode, on visited intervals."""
+    """Jacobians by reverse mode equal those by forward mode, by states on visited intervals."""
     _, flown, exogenous = recorded(plant, batch=2)
     closure = disturbed(plant, 0.3)
     names = tuple(name for name, _ in closure.named_parameters())
     interval, drive = Interval(plant, closure, None), drive_of(plant, exogenous, flown.actions)
     starts, drive = as_one_batch(flown.states[:, :-1].transpose(0, 1), drive)
     with torch.no_grad():
-        columns, rows = (f(interval, names, starts, drive) for f in (linearise, linearise_by_rows))
+        columns, rows = linearise(interval, starts, drive), jacobians_of(interval, names, starts, drive)
+    assert rows.shape[-1] == columns.shape[-1] + sum(w.numel() for w in closure.parameters())
+    rows = rows[..., : columns.shape[-1]]
     # The same derivatives in another order: rounding, relative to the largest of each state.
     assert ((columns - rows).abs().amax((0, 2)) <= 1e-10 * columns.abs().amax((0, 2)).clamp(min=1e-300)).all()
 

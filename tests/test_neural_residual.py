@@ -326,8 +326,11 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda base: NeuralResidual(base, {}, inputs=("force",)), r"names no state.*'position', 'velocity'"),
-        (lambda base: NeuralResidual(base, {"height": 1.0}, inputs=("force",)), r"reads a state 'height'"),
+        (lambda base: NeuralResidual(base, {}, inputs=("force",)), r"greatest=\{\} must name.*'position', 'velocity'"),
+        (
+            lambda base: NeuralResidual(base, {"height": 1.0}, inputs=("force",)),
+            r"greatest=.*'height'.* must name states",
+        ),
         (lambda base: NeuralResidual(base, {"velocity": 0.0}, inputs=("force",)), r"greatest=0.0 of 'velocity'"),
         (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("speed",)), r"inputs=\('speed',\).*'force'"),
         (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=()), r"inputs=\(\)"),
@@ -341,11 +344,11 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
         ),
         (
             lambda base: NeuralResidual(LaggedActuator(base, "force", 1.0), {"lagged_force": 1.0}, inputs=("force",)),
-            r"no sensor.*reads a state 'lagged_force'",
+            r"greatest=.*'lagged_force'.* a sensor reads",
         ),
         (
             lambda base: NeuralResidual(WindTurbine(), {"blade_pitch": 1.0}, inputs=("blade_pitch",)),
-            r"the controller of plant 'wind_turbine' computes 'blade_pitch'",
+            r"greatest=.*'blade_pitch'.*'wind_turbine' .*no controller computes; choose some of 'rotor_speed'",
         ),
         (
             lambda base: make_twin(base, base.closure, HypothesesConfig(names=("no, never",))),

@@ -1,6 +1,5 @@
 """The closure's weights and the twin's errors on the terminal."""
 
-import pytest
 import torch
 
 from rt_torchrl.envs.pendulum.plant import UniformRod
@@ -25,14 +24,6 @@ def test_units_and_meanings_are_shown_where_the_closure_states_them():
     assert shown[1].split() == ["mass", "[kg]", "0.5", "1", "mass", "of", "the", "rod"]
     assert shown[2].split() == ["length", "[m]", "0.5", "0.75", "length", "of", "the", "rod"]
     assert described_weights(torch.nn.Linear(1, 1)) == {}
-
-
-def test_a_meaning_without_a_coefficient_is_refused():
-    class Misspelt(UniformRod):
-        meanings = {"mas": "mass of the rod"}
-
-    with pytest.raises(ValueError, match="meanings of Misspelt describes mas, which names lacks"):
-        Misspelt.guess(1.0)
 
 
 def test_standard_errors_stand_beside_the_weights():

@@ -20,7 +20,7 @@ from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines import code
-from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout

@@ -18,8 +18,8 @@ from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.plants.actuators import LaggedActuator, ScaledActuator
-from rt_torchrl.plants.coefficients import LaggedCoefficients, ScaledCoefficients
 from rt_torchrl.plants.sensors import UnreadInput
+from rt_torchrl.plants.vector_field import LaggedCoefficients, ScaledCoefficients
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -163,7 +163,7 @@ def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixe
     ("make", "message"),
     [
         (lambda: ScaledActuator(LinearQuadratic(), "force", 0.0), "gain=0.0 of force must be positive"),
-        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind' is no input.*disturbance"),
+        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind'.*does not exist.*disturbance"),
         (lambda: UnreadInput(LinearQuadratic(), "disturbance", 1.0, ()), r"frequencies=\(\) .* must be positive"),
         (lambda: ScaledCoefficients(LinearQuadratic(), 0.0), "gain=0.0 of the coefficients"),
         (lambda: ScaledCoefficients(LaggedActuator(LinearQuadratic(), "force", 1.0), 0.5), "closure of the plant"),

@@ -53,7 +53,7 @@ def compared(interval, initial_state, drive, *, lanes=None, seed=5):
     """States and gradients by all leaves: of machine code and of eager torch."""
     programs = traced(interval, initial_state, drive, lanes)
     leaves = [x.clone().requires_grad_() for x in (initial_state, *drive)]
-    task = native._Task(programs, Inputs(interval), leaves[0], Drive(*leaves[1:]), native.MEMORY)
+    task = native._Task(programs, Inputs(interval), leaves[0], Drive(*leaves[1:]))
     found = native._EndStates.apply(task, *leaves, *task.inputs.learned)
     exact = marched(interval, *leaves)
     costate = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.extension import Extension, System, combined, require_systems
-from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.plants.shapes import Action, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.vector_field import NeuralResidual
 
 HOUR = 3600.0
 EPISODE = 120.0 * HOUR

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from functools import partial
 
 from rt_torchrl.plants.actuators import LaggedActuator, ResonantActuator, ScaledActuator
-from rt_torchrl.plants.coefficients import LaggedCoefficients
 from rt_torchrl.plants.extension import System, combined, require_systems
-from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import UnreadInput
+from rt_torchrl.plants.vector_field import LaggedCoefficients, NeuralResidual
 
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 STAGES = 12

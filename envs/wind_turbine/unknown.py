@@ -13,12 +13,11 @@ from torch import nn
 
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.coefficients import ScaledCoefficients
 from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
-from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Hidden, Input, Inputs, State, Time
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.vector_field import NeuralResidual, ScaledCoefficients
 
 PITCH_LAG = 0.7
 """Lag of the pitch drive with which an identification begins [s]."""

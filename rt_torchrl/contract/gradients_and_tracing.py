@@ -213,7 +213,7 @@ def forward_mode(calls: Calls) -> Iterator[str]:
     interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
     try:
         with without_warnings_of_libraries():
-            jacobians = linearise(interval, (), state.detach(), drive)
+            jacobians = linearise(interval, state.detach(), drive)
     except Exception as error:
         yield f"step: torch.func.jvp under vmap fails: {first_line(error)} {_where(error)}Expected {TRACEABLE}."
         return

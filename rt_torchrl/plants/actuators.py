@@ -6,10 +6,10 @@ import torch
 from torch import nn
 
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension, place_of, replaced, settled
+from rt_torchrl.plants.extension import Extension, replaced, settled
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Hidden, State
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Signal, place_of
 
 LONGEST_DELAY = 64
 """Greatest number of control intervals of a delay: each is a hidden state, which every engine carries along."""
@@ -39,7 +39,7 @@ class LaggedActuator(Extension):
     def __init__(self, base: Plant, action: str, time_constant: float, *, stages: int = 1):
         if stages < 1:
             raise ValueError(f"stages={stages} of {action} must be at least 1.")
-        self.place, self.stages = place_of(base, action), stages
+        self.place, self.stages = place_of("action", action, base.actions, base.name), stages
         signal, ends = base.actions[self.place], [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
         hidden = [
             Signal(symbol=f"{signal.symbol}'{end}", name=f"lagged_{action}{end}", unit=signal.unit) for end in ends
@@ -89,7 +89,7 @@ class ResonantActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, frequency: float, damping: float):
-        self.place = place_of(base, action)
+        self.place = place_of("action", action, base.actions, base.name)
         if not 0.0 < damping < 1.0:
             raise ValueError(f"damping={damping} of {action} must lie in (0, 1); use LaggedActuator beyond.")
         signal = base.actions[self.place]
@@ -146,7 +146,7 @@ class DelayedActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, delay: float):
-        self.place, self.intervals = place_of(base, action), round(delay / base.dt)
+        self.place, self.intervals = place_of("action", action, base.actions, base.name), round(delay / base.dt)
         n, signal = self.intervals, base.actions[self.place]
         if not (1 <= n <= LONGEST_DELAY and math.isclose(n * base.dt, delay, rel_tol=1e-9)):
             raise ValueError(
@@ -190,7 +190,7 @@ class ScaledActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, gain: float):
-        self.place, self.gain = place_of(base, action), gain
+        self.place, self.gain = place_of("action", action, base.actions, base.name), gain
         if not 0.0 < gain < math.inf:
             raise ValueError(f"gain={gain} of {action} must be positive and finite, such as 0.95 for a loss of 5 %.")
         super().__init__(base, [])

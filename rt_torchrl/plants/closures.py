@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -32,8 +32,7 @@ class PositiveCoefficients(nn.Module):
         factor: greatest factor f by which a coefficient differs from its first value; None for no bound.
 
     Raises:
-        ValueError: if the number of coefficients is wrong, one of them is not positive and finite, or a meaning is
-            given for a coefficient that does not exist.
+        ValueError: if the number of coefficients is wrong, or one of them is not positive and finite.
     """
 
     names: dict[str, str] = {}
@@ -63,12 +62,6 @@ class PositiveCoefficients(nn.Module):
             raise ValueError(
                 f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and "
                 f"finite{known}."
-            )
-        unknown = self.meanings.keys() - self.names.keys()
-        if unknown:
-            raise ValueError(
-                f"meanings of {type(self).__name__} describes {', '.join(sorted(unknown))}, which names lacks; its "
-                f"coefficients are {', '.join(self.names)}."
             )
         self.factor = factor
         if factor is None:
@@ -143,21 +136,10 @@ class BoundedPerceptron(nn.Module):
         return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))
 
 
-@runtime_checkable
-class DescribedCoefficients(Protocol):
-    """A closure that says what its coefficients are."""
-
-    names: dict[str, str]
-    """Unit of each coefficient, by name."""
-    meanings: dict[str, str]
-    """What each coefficient is, in a few words, by name; some may be missing."""
-
-
 def described_weights(closure: nn.Module) -> dict[str, dict[str, str]]:
     """``unit`` and ``meaning`` of each coefficient, by name; none of a closure that does not say what they are."""
-    if not isinstance(closure, DescribedCoefficients):
-        return {}
-    return {name: {"unit": unit, "meaning": closure.meanings.get(name, "")} for name, unit in closure.names.items()}
+    names, meanings = getattr(closure, "names", {}), getattr(closure, "meanings", {})
+    return {name: {"unit": unit, "meaning": meanings.get(name, "")} for name, unit in names.items()}
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """A plant with additional dynamics, which no sensor reads, and real systems that are made of such plants by name."""
 
 import copy
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.closures import PositiveCoefficients
-from rt_torchrl.plants.plant import Part, Plant
+from rt_torchrl.plants.plant import PARTS, Plant
 from rt_torchrl.plants.shapes import Action, Cost, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
 
@@ -160,10 +161,14 @@ class Extension(Plant):
             raise TypeError(f"own={type(own).__name__} of {type(self).__name__} must be PositiveCoefficients.")
         return own.coefficients
 
+    def law(self, closure: nn.Module) -> nn.Module:
+        """The closure that acts on the plant; by default that of the plant."""
+        return self.of_base(closure)
+
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, hidden = self.split(state)
         acting, met = self.acting(hidden, action), self.meeting(hidden, exogenous)
-        field = self.base.vector_field(t, base, acting, met, self.of_base(closure))
+        field = self.base.vector_field(t, base, acting, met, self.law(closure))
         return self.joined(field, self.rates(hidden, action, closure))
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
@@ -171,34 +176,34 @@ class Extension(Plant):
         base, hidden = self.split(state)
         acting, end = self.respond(hidden, applied, closure)
         met = self.meeting(hidden, exogenous)
-        return self.joined(self.base.advance(t, base, acting, met, self.of_base(closure)), end)
+        return self.joined(self.base.advance(t, base, acting, met, self.law(closure)), end)
 
     @property
     def discrepancy_scales(self) -> tuple[float, ...]:
         """Those of the plant; hidden states, which no sensor reads, are not compared."""
         return (*self.base.discrepancy_scales, *(math.inf,) * (len(self.states) - len(self.base.states)))
 
-    def ask(self, which: Part, name: str, given: dict[str, Any]) -> Any:
+    def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
         """What the plant answers when a method is called, in its own states, with what the extension has beside it.
 
         Args:
-            which: part of the plant that the method is, see :func:`~rt_torchrl.plants.plant.part`.
-            name: name of the method.
+            part: what the method is about, see :data:`~rt_torchrl.plants.plant.PARTS`.
+            method: name of the method.
             given: arguments by name, in their order.
         """
         hidden: Any = None
         for place in given.keys() & {"state", "states"}:
             base, hidden = self.split(given[place])
-            given[place] = self.true_state(given[place]) if which == "task" else base
-            if which == "task" and "applied" in given:  # a state for each action, of episodes perhaps one more
+            given[place] = self.true_state(given[place]) if part == "task" else base
+            if part == "task" and "applied" in given:  # a state for each action, of episodes perhaps one more
                 at = hidden[..., : given["applied"].shape[-2], :] if place == "states" else hidden
                 given["applied"] = self.acting(at, given["applied"])
-        answer = getattr(self.base, name)(*given.values())
-        if which == "memory":
+        answer = getattr(self.base, method)(*given.values())
+        if part == "memory":
             return self.joined(answer, hidden)
-        if which == "start":
+        if part == "start":
             return self.joined(answer, self.rest(answer))
-        return self._with_own(answer) if which == "closure" else answer
+        return self._with_own(answer) if part == "closure" else answer
 
     def extended(self, closure: nn.Module) -> nn.Module:
         """A closure of the plant without extensions, with the parameters of all its extensions beside it."""
@@ -208,16 +213,20 @@ class Extension(Plant):
         return ExtendedClosure(closure, self.fresh()) if self._parameterised else closure
 
 
-def place_of(plant: Plant, action: str) -> int:
-    """Place of an action of a plant.
+def _asked(part: str, method: str) -> Callable[..., Any]:
+    """A method of an extension that asks the plant for its answer."""
+    names = tuple(inspect.signature(getattr(Plant, method)).parameters)[1:]
 
-    Raises:
-        ValueError: if the plant has no such action.
-    """
-    names = [signal.name for signal in plant.actions]
-    if action not in names:
-        raise ValueError(f"action={action!r} of plant {plant.name!r} does not exist; choose one of {', '.join(names)}.")
-    return names.index(action)
+    def answer(extension: Extension, *given: Any, **named: Any) -> Any:
+        values = dict(zip(names, given, strict=False)) | named
+        return extension.ask(part, method, {name: values[name] for name in names})
+
+    return answer
+
+
+for _part, _methods in PARTS.items():
+    for _method in _methods:
+        setattr(Extension, _method, _asked(_part, _method))
 
 
 def settled(plant: Plant, action: int, states: State) -> Cost:

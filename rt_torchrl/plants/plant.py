@@ -18,12 +18,11 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 :math:`-L_e/(1 - \gamma)`.
 """
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial, wraps
+from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,7 +32,7 @@ from rt_torchrl.options import check_options
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import rk4_step, whole_steps
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Ended, Input, Inputs, Observation, State, States, Time
-from rt_torchrl.plants.signal import Measurement, Preview, Signal, bounds, chosen, differences
+from rt_torchrl.plants.signal import Measurement, Preview, Signal, bounds, differences
 
 
 class Transition(NamedTuple):
@@ -43,34 +42,17 @@ class Transition(NamedTuple):
     applied: Tensor
 
 
-Part = Literal["controller", "memory", "task", "start", "closure"]
-Method = TypeVar("Method", bound=Callable[..., Any])
 REQUIRED = ("vector_field", "running_cost", "draw_initial_state", "draw_exogenous", "make_closure")
 """Methods that a plant must define."""
-
-
-def part(which: Part) -> Callable[[Method], Method]:
-    """Say which part of a plant a method is, so that an :class:`Extension` of the plant asks the plant for it.
-
-    Args:
-        which: the controller, which knows what sensors read; its memory, which it writes into the states; the task,
-            which is about true states and the action that acts; states at the start; or a closure.
-    """
-
-    def marked(method: Method) -> Method:
-        names = tuple(inspect.signature(method).parameters)[1:]
-
-        @wraps(method)
-        def answer(plant: Any, *given: Any, **named: Any) -> Any:
-            if plant.innermost is plant:
-                return method(plant, *given, **named)
-            values = dict(zip(names, given, strict=False)) | named
-            return plant.ask(which, method.__name__, {name: values[name] for name in names})
-
-        vars(answer)["part"] = which
-        return cast(Method, answer)
-
-    return marked
+PARTS = {
+    "controller": ("observe", "actuate", "controller_start", "make_policy"),
+    "memory": ("memorise", "latch"),
+    "task": ("running_cost", "terminal_cost", "ended", "merit", "setpoints", "categories", "draw_exogenous"),
+    "start": ("at_rest", "complete_states", "draw_initial_state"),
+    "closure": ("make_closure", "make_neural_closure"),
+}
+"""Methods for which an extension asks its plant, by what they are about: what a controller knows, which is what sensors
+read; what it writes into the states; the task in true states; states at the start; closures."""
 
 
 class Plant(nn.Module):
@@ -147,12 +129,27 @@ class Plant(nn.Module):
 
     @classmethod
     def chosen(cls, observe: Sequence[str]) -> tuple[Measurement, ...]:
-        """The measurements that ``observe`` names.
+        """The measurements that policies observe, each once and in the order in which they are asked for.
+
+        Args:
+            observe: names of measurements and of sets of them; nothing means the first set.
 
         Raises:
             ValueError: if there is no such measurement or set.
         """
-        return chosen(cls.name, observe, cls.measurements, cls.observation_sets)
+        if isinstance(observe, str):
+            raise ValueError(f"observe={observe!r} of plant {cls.name!r} must be a sequence of names, not a text.")
+        known, sets = {measurement.name: measurement for measurement in cls.measurements}, cls.observation_sets
+        observe = observe or tuple(sets)[:1] or tuple(known)
+        unknown = [name for name in observe if name not in known and name not in sets]
+        if unknown:
+            raise ValueError(
+                f"observe={tuple(observe)} of plant {cls.name!r}: {', '.join(unknown)} does not exist; choose among "
+                f"the sets {', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
+            )
+        return tuple(
+            known[name] for name in dict.fromkeys(name for word in observe for name in sets.get(word, (word,)))
+        )
 
     @property
     def acting_inputs(self) -> tuple[Signal, ...]:
@@ -190,12 +187,10 @@ class Plant(nn.Module):
         """Time derivative of the state, ds/dt = f(t, s, a, z, g(s; w_p)), for a held action and exogenous input."""
         raise NotImplementedError
 
-    @part("controller")
     def actuate(self, state: State, command: Action) -> Action:
         """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
-    @part("memory")
     def memorise(self, t: Time, state: State, exogenous: Input) -> State:
         """The state, into which the controller writes what it keeps of this moment's signals; by default nothing.
 
@@ -203,7 +198,6 @@ class Plant(nn.Module):
         """
         return state
 
-    @part("memory")
     def latch(self, state: State, applied: Action) -> State:
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
@@ -230,14 +224,12 @@ class Plant(nn.Module):
         applied = self.actuate(state, command)
         return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
-    @part("start")
     def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return read
 
     # Task
 
-    @part("controller")
     def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """The observation of the policies, scaled to order one, such as tracking errors.
 
@@ -250,7 +242,6 @@ class Plant(nn.Module):
         _, *seen = torch.broadcast_tensors(state[..., 0], *seen)
         return torch.stack(seen, -1)
 
-    @part("task")
     def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         r"""Lagrangian L_a of the control problem; the reward is −L_a.
 
@@ -258,12 +249,10 @@ class Plant(nn.Module):
         """
         raise NotImplementedError
 
-    @part("task")
     def terminal_cost(self, state: State) -> Cost:
         """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
         return state.new_zeros(state.shape[:-1])
 
-    @part("task")
     def ended(self, state: State) -> Ended:
         """Whether an episode has ended in this state; by default never.
 
@@ -300,32 +289,20 @@ class Plant(nn.Module):
         difference = differences(signals, state[..., compared], measured[..., compared])
         return 0.5 * ((difference / state.new_tensor([scales[k] for k in compared])) ** 2).sum(-1)
 
-    @part("task")
     def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
         """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
         return {}
 
-    @part("task")
-    def setpoints(
-        self,
-        states: Float[Tensor, "*batch n n_s"],
-        applied: Float[Tensor, "*batch n n_a"],
-        exogenous: Float[Tensor, "*batch n n_z"],
-    ) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
+    def setpoints(self, states: State, applied: Action, exogenous: Input) -> dict[str, tuple[Cost, Cost]]:
         """Quantities to be held, named with their units: value and setpoint in each interval; by default none."""
         return {}
 
-    @part("task")
     def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
         """Kinds of episodes, by name, for which results are also shown separately; by default none."""
         return {}
 
-    @part("start")
     def complete_states(
-        self,
-        measured: dict[str, Float[Tensor, " samples"]],
-        exogenous: Float[Tensor, "n n_z"],
-        actions: Float[Tensor, "n n_a"],
+        self, measured: dict[str, Float[Tensor, " samples"]], exogenous: Input, actions: Action
     ) -> Float[Tensor, "samples n_s"]:
         """All states at n + 1 samples, completed from the states in a log; by default the log must hold all states.
 
@@ -346,10 +323,7 @@ class Plant(nn.Module):
             )
         return torch.stack([measured[state.name] for state in self.states], -1)
 
-    @part("controller")
-    def controller_start(
-        self, measured: Float[Tensor, "*batch n_y"], exogenous: Float[Tensor, "*batch n_z"]
-    ) -> Float[Tensor, "*batch n_c"]:
+    def controller_start(self, measured: Float[Tensor, "*batch n_y"], exogenous: Input) -> Float[Tensor, "*batch n_c"]:
         """The :attr:`controller_states` of a controller that is switched on, given the other ones; by default zeros."""
         return measured.new_zeros(*measured.shape[:-1], len(self.controller_states))
 
@@ -364,22 +338,18 @@ class Plant(nn.Module):
 
     # Draws, always from the generator that is passed in
 
-    @part("start")
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
         """Initial states of ``batch`` episodes."""
         raise NotImplementedError
 
-    @part("task")
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
         """Exogenous inputs of ``batch`` episodes, one sample per control interval."""
         raise NotImplementedError
 
-    @part("closure")
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """The closure that a twin of this plant starts from, with the weights w_p⁰."""
         raise NotImplementedError
 
-    @part("closure")
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
         """A closure with a perceptron that starts with the values of :meth:`make_closure`; by default there is none.
 
@@ -398,7 +368,6 @@ class Plant(nn.Module):
         """Suspects that hypotheses take only by name, such as a :class:`NeuralResidual`; by default none."""
         return {}
 
-    @part("controller")
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The policy that both controllers start from, w_a⁰; by default a saturated affine law of the observation."""
         return SaturatedAffine(len(self.observations), self.actions, generator=generator)
@@ -466,11 +435,7 @@ def final_cost(plant: Plant, state: State) -> Cost:
 
 
 def flight_costs(
-    plant: Plant,
-    t: Tensor,
-    states: Float[Tensor, "*batch m n_s"],
-    applied: Float[Tensor, "*batch n n_a"],
-    exogenous: Float[Tensor, "*batch n n_z"],
+    plant: Plant, t: Tensor, states: Float[Tensor, "*batch m n_s"], applied: Tensor, exogenous: Tensor
 ) -> tuple[Float[Tensor, "*batch n"], Ended]:
     """L_a in each interval of a flight, or L_e from its early end on, and whether it has ended by its last state.
 

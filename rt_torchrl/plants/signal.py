@@ -80,6 +80,25 @@ class Signal:
         return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"
 
 
+def place_of(argument: str, name: str, signals: Sequence[Signal], plant: str) -> int:
+    """Place of the signal of a name.
+
+    Args:
+        argument: name of the argument, for the message.
+        name: name of the signal.
+        signals: the signals to choose among.
+        plant: name of their plant, for the message.
+
+    Raises:
+        ValueError: if there is no such signal.
+    """
+    names = [signal.name for signal in signals]
+    if name not in names:
+        known = ", ".join(names) or "(none)"
+        raise ValueError(f"{argument}={name!r} of plant {plant!r} does not exist; choose one of {known}.")
+    return names.index(name)
+
+
 def differences(
     signals: Sequence[Signal], first: Float[Tensor, "*batch n"], second: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch n"]:
@@ -265,34 +284,6 @@ class Measurement(Signal):
     def observed(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         """The observation (y − offset)/scale."""
         return (self.read(plant, t, state, exogenous) - self.offset) / self.scale
-
-
-def chosen(
-    plant: str, wanted: Sequence[str], measurements: Sequence[Measurement], sets: Mapping[str, Sequence[str]]
-) -> tuple[Measurement, ...]:
-    """The measurements that a policy observes, each once and in the order in which they are asked for.
-
-    Args:
-        plant: name of the plant, for the message.
-        wanted: names of measurements and of sets of them; nothing means the first set.
-        measurements: all measurements of the plant.
-        sets: names of measurements, by the name of the set.
-
-    Raises:
-        ValueError: if there is no such measurement or set.
-    """
-    if isinstance(wanted, str):
-        raise ValueError(f"observe={wanted!r} of plant {plant!r} must be a sequence of names, such as ({wanted!r},).")
-    known = {measurement.name: measurement for measurement in measurements}
-    wanted = wanted or tuple(sets)[:1] or tuple(known)
-    unknown = [name for name in wanted if name not in known and name not in sets]
-    if unknown:
-        raise ValueError(
-            f"observe={tuple(wanted)} of plant {plant!r}: {', '.join(unknown)} does not exist; choose among the sets "
-            f"{', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
-        )
-    names = dict.fromkeys(name for word in wanted for name in sets.get(word, (word,)))
-    return tuple(known[name] for name in names)
 
 
 class StateBounds:

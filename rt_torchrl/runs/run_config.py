@@ -54,8 +54,8 @@ class RunConfig:
         engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
             GPUs), odeint_adjoint (the paper's continuous adjoint, slow) or autograd (exact, slow).
         compiled: whether to compile with torch.compile what PyTorch computes. By default the engine native compiles
-            nothing, because it computes itself; other engines and devices compile if this machine can, and a notice
-            says if it cannot. Without compilation these start at once, but every step is several times slower.
+            nothing, because it computes itself; beside other engines, what may be compiled (parallel, environments) is
+            if this machine can, and a notice says if it cannot. Without it every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default or, beside an acting process, takes the cores that it
             leaves. Updates of step 2 run on one.

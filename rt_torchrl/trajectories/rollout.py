@@ -10,7 +10,7 @@ engine                gradient                                            for
 ====================  ==================================================  ======================================
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -33,10 +33,6 @@ ENGINES: dict[Engine, type[GradientEngine]] = {
     "odeint_adjoint": OdeintAdjoint,
     "autograd": Autograd,
 }
-
-
-HELD = 2**18
-"""Greatest number of numbers of tensors whose drive a rollout holds for the next call."""
 
 
 class DivergenceError(FloatingPointError):
@@ -77,7 +73,6 @@ class Rollout:
         self._costed = CostInterval(self.interval)
         self.engine = engine
         self._engine = ENGINES[engine](compiled=compiled)
-        self._driven: tuple[tuple[object, ...], Drive, tuple[Tensor | None, ...]] | None = None
 
     def __call__(
         self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0
@@ -117,7 +112,7 @@ class Rollout:
         # What is replayed runs on after an end, so that only its trajectory says when it ended.
         summed = self.plant.end_cost is None or self.interval.policy is not None
         self._require_pure(self._costed, functional.pad(initial_state, (0, 1)), drive)
-        found = self._engine.costs(self.interval, initial_state, drive) if summed else None
+        found = self._engine.costs(self._costed, initial_state, drive) if summed else None
         if found is not None and all_finite(found):
             charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
             if charged:  # the sum holds the change from the first state's
@@ -130,30 +125,12 @@ class Rollout:
             require_pure_once(interval, initial_state, drive)
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:
-        """The drive, after a check of everything; that of the last call if the same small tensors come again.
-
-        A planner asks many times for one scenario. The drive shares the memory of the tensors, so that their numbers
-        are always the present ones.
-        """
-        given = initial_state, exogenous, command
-        stamps = None if isinstance(start, Tensor) else (start, self.plant.dt, *map(_stamp, given))
-        held = self._driven
-        if held is not None and held[0] == stamps:
-            return held[1]
-        drive, self._driven = self._checked_drive(initial_state, exogenous, command, start), None
-        if stamps is not None and all(map(_repeatable, given)):
-            self._driven = stamps, drive, given
-        return drive
-
-    def _checked_drive(
-        self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor
-    ) -> Drive:
+        """The drive, after a check of everything."""
         self._validate(initial_state, exogenous, command)
-        if isinstance(start, Tensor) and not self._engine.start_per_realisation:
-            others = _listed(name for name, kind in ENGINES.items() if kind.start_per_realisation)
+        if isinstance(start, Tensor) and not self._engine.exact:
             raise ValueError(
                 f"engine={self.engine!r} integrates all realisations over the same span and takes no start for each; "
-                f"use {others}, or whole records (segment=0)."
+                f"use {_exact()}, or whole records (segment=0)."
             )
         return drive_of(self.plant, exogenous, command, start=start)
 
@@ -180,26 +157,13 @@ class Rollout:
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
 
 
-def _stamp(x: Tensor | None) -> object:
-    """What tells a tensor as it is from others, as long as it is held."""
-    if x is None or x.is_inference():  # which has no version
-        return x is None
-    return id(x), x._version, x.data_ptr(), x.requires_grad
-
-
-def _repeatable(x: Tensor | None) -> bool:
-    """Whether the drive of a tensor may be held: it keeps little memory alive, and nothing is differentiated by it."""
-    return x is None or not (x.requires_grad or x.is_inference() or x.numel() > HELD)
-
-
 def refusal(engine: Engine, plant: Plant) -> str | None:
     """The reason why an engine cannot roll a plant out, for a message; None if it can."""
     if engine not in ENGINES:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
-    if not ENGINES[engine].own_scheme and (plant.own_scheme or plant.end_cost is not None):
-        others = _listed(name for name, kind in ENGINES.items() if kind.own_scheme)
+    if not ENGINES[engine].exact and (plant.own_scheme or plant.end_cost is not None):
         does = "steps by a scheme of its own" if plant.own_scheme else "has episodes that end early"
-        return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use {others}."
+        return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use {_exact()}."
     return None
 
 
@@ -208,8 +172,8 @@ def able(engine: Engine, plant: Plant) -> Engine:
     return "autograd" if engine in ENGINES and refusal(engine, plant) else engine
 
 
-def _listed(names: Iterable[str]) -> str:
-    *others, last = names
+def _exact() -> str:
+    *others, last = (name for name, kind in ENGINES.items() if kind.exact)
     return f"{', '.join(others)} or {last}"
 
 

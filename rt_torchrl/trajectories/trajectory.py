@@ -83,18 +83,14 @@ class Trajectory(NamedTuple):
             None if seen is None else pieces(seen),
         )
 
-    def rows(self, chosen: Int[Tensor, " m"]) -> "Trajectory":
-        """Some trajectories of a batch, of which one may be there several times."""
-        start = self.start[chosen] if isinstance(self.start, Tensor) else self.start
-        seen = None if self.seen is None else self.seen[chosen]
-        return Trajectory(self.states[chosen], self.actions[chosen], self.exogenous[chosen], start, seen)
+    def rows(self, chosen: int | Int[Tensor, " m"]) -> "Trajectory":
+        """Some trajectories of a batch, of which one may be there several times, or one by its number."""
+        return self.mapped(lambda part: part[chosen])
 
     def each(self) -> "list[Trajectory]":
         """The trajectories of a batch, one by one."""
         starts = torch.as_tensor(self.start, dtype=torch.float64, device="cpu").expand(len(self.states)).tolist()
-        seen = [None] * len(starts) if self.seen is None else self.seen
-        parts = zip(self.states, self.actions, self.exogenous, starts, seen, strict=True)
-        return [Trajectory(*part) for part in parts]
+        return [self.rows(k)._replace(start=start) for k, start in enumerate(starts)]
 
 
 def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:

@@ -1,17 +1,31 @@
-"""The digital twin: a plant's vector field and step under a learned closure."""
+r"""The digital twin: a plant's step under a learned closure, and how its states depend on the closure's weights.
+
+.. math::
+    S_0 = 0, \qquad S_{k+1} = A_kS_k + B_k, \quad
+    A_k = \frac{\partial\Phi}{\partial s}(s_k, x_k), \quad B_k = \frac{\partial\Phi}{\partial w}(s_k, x_k)
+
+Here :math:`S_k = ds_k/dw_p` are the sensitivities, whose recurrence the engine ``native`` runs as a part of the
+trajectory's. They give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their
+cost grows with the number of weights, unlike that of an adjoint: they are for up to some hundred weights.
+"""
 
 import copy
+from functools import partial
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
-from rt_torchrl.trajectories.rollout import Engine, Rollout, able, require_double
-from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.engines import Native
+from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
+from rt_torchrl.trajectories.engines.parallel import over_all
+from rt_torchrl.trajectories.rollout import Engine, Rollout, able, drive_of, require_double
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
@@ -145,3 +159,106 @@ def constant(module: nn.Module) -> nn.Module:
     shared: dict[int, Tensor] = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
     shared |= {id(buffer): buffer for buffer in module.buffers()}
     return copy.deepcopy(module, shared)
+
+
+# Sensitivities
+
+WIDE = 64
+"""Number of columns of S from which batched Jacobians by torch are quicker than one recurrence of states and S."""
+
+
+class TangentInterval(nn.Module):
+    """An interval whose state (s, S) also holds the sensitivities S, flattened, of weights and of initial states.
+
+    Args:
+        interval: the interval of the states s, with the closure whose trained weights come first among the columns.
+        names: names of these weights in the closure. While the interval is traced, other tensors stand for them, which
+            ask for no gradients.
+    """
+
+    straight = 400
+    """Rows of Jacobians are long but mostly zero, which straight-line code leaves out and loops do not."""
+
+    def __init__(self, interval: Interval, names: tuple[str, ...]):
+        super().__init__()
+        self.interval, self.names = interval, names
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """States and sensitivities, (s, S), at the end of the interval."""
+        n_s = len(self.interval.plant.states)
+        s, S = state[..., :n_s], state[..., n_s:].unflatten(-1, (n_s, -1))
+        jacobians = jacobians_of(self.interval, self.names, s, drive._replace(t=drive.t.expand(s.shape[:1])))
+        return torch.cat([self.interval(s, drive), _propagated(jacobians, S).flatten(1)], -1)
+
+
+def jacobians_of(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """[∂Φ/∂s, ∂Φ/∂w] of every row, ``rows n_s n_s+n_w``, by a reverse-mode product for each state."""
+    held = dict(interval.closure.named_parameters())
+    weights = {f"closure.{name}": held[name] for name in names}
+
+    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
+        return with_weights(interval, values, state, Drive(*drive))
+
+    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
+    by_state, by_weights = rows(weights, starts, *drive)
+    # A weight may be one number, of no dimension.
+    parts = (jacobian.reshape(*by_state.shape[:2], -1) for jacobian in by_weights.values())
+    return torch.cat([by_state, *parts], -1)
+
+
+def _propagated(jacobians: Tensor, S: Tensor) -> Tensor:
+    """The sensitivities at the end of an interval; s_0 acts like weights that are used in the first one alone."""
+    A, B = jacobians.tensor_split([jacobians.shape[-2]], -1)
+    return A @ S + functional.pad(B, (0, S.shape[-1] - B.shape[-1]))
+
+
+class Sensitivities:
+    """Trajectories under recorded actions with their sensitivities.
+
+    Args:
+        plant: the physics.
+        closure: closure with the trainable weights w_p, flattened in the order of ``parameters()``.
+    """
+
+    def __init__(self, plant: Plant, closure: nn.Module):
+        self.interval = Interval(plant, closure, None)
+        self._tangent = TangentInterval(self.interval, self._trained())
+        self._engine = Native(compiled=False)
+
+    @torch.no_grad()
+    def __call__(
+        self, initial_state: Starts, exogenous: Inputs, actions: Actions, *, start: Start = 0.0, initial: bool = False
+    ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
+        """States s_1 ... s_n and their sensitivities S_1 ... S_n.
+
+        Args:
+            initial_state: initial state s_0 of each trajectory.
+            exogenous: exogenous inputs z, held over each interval.
+            actions: actions, held over each interval.
+            start: time of s_0 [s], one for all trajectories or one for each.
+            initial: append the n_s columns of ds_k/ds_0.
+        """
+        drive = drive_of(self.interval.plant, exogenous, actions, start=start)
+        batch, n_s = initial_state.shape
+        if self._tangent.names != self._trained():  # a weight was frozen or freed since
+            self._tangent = TangentInterval(self.interval, self._trained())
+        count = sum(w.numel() for w in self.interval.closure.parameters() if w.requires_grad)
+        S = initial_state.new_zeros(batch, n_s, count)
+        if initial:
+            S = torch.cat([S, torch.eye(n_s, dtype=S.dtype, device=S.device).expand(batch, -1, -1)], -1)
+        state, found = torch.cat([initial_state, S.flatten(1)], -1), None
+        if S.shape[-1] <= WIDE:
+            found = self._engine.own_end_states(self._tangent, state, drive)
+        if found is not None:
+            ends, S_ends = found.split([n_s, n_s * S.shape[-1]], -1)
+            S_ends = S_ends.unflatten(-1, S.shape[1:])
+        else:
+            ends = self._engine.end_states(self.interval, initial_state, drive)
+            starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
+            jacobians = over_all(partial(jacobians_of, self.interval, self._trained()), starts, drive)
+            S_ends = torch.stack([*accumulate(jacobians, lambda S, now: _propagated(now, S), initial=S)][1:])
+        return ends.transpose(0, 1), S_ends.transpose(0, 1)
+
+    def _trained(self) -> tuple[str, ...]:
+        """Names of the closure's trained weights."""
+        return tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)

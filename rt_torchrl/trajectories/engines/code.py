@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, cached_property
 from itertools import accumulate, chain, islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -447,10 +447,7 @@ def require_pure_once(interval: nn.Module, initial_state: Tensor, drive: Drive) 
     Raises:
         ImpureError: as :func:`require_pure`.
     """
-    modes = tuple(module.training for module in interval.modules())
-    if _modes.get(interval) != modes:
-        require_pure(interval, *point_of(initial_state, drive, ROWS))
-        _modes[interval] = modes
+    _require_once(interval, interval, lambda: point_of(initial_state, drive, ROWS))
 
 
 def require_pure_policy(policy: nn.Module, observation: Tensor) -> None:
@@ -463,21 +460,13 @@ def require_pure_policy(policy: nn.Module, observation: Tensor) -> None:
     Raises:
         ImpureError: as :func:`require_pure`.
     """
-    modes = tuple(module.training for module in policy.modules())
-    if _modes.get(policy) != modes:
-        nothing = observation.new_zeros(1, len(observation), 0)
-        rows = point_of(observation, Drive(observation.new_zeros(1, 1), nothing, nothing), ROWS).state
-        require_pure(_Answer(policy), rows)
-        _modes[policy] = modes
+    rows = torch.arange(ROWS, device=observation.device) % len(observation)
+    named = nn.Sequential(OrderedDict(policy=policy))  # messages name it by its place
+    _require_once(policy, named, lambda: (_nudged(observation.detach()[rows]),))
 
 
-class _Answer(nn.Module):
-    """What a policy answers, as if it were an interval."""
-
-    def __init__(self, policy: nn.Module):
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, observation: Tensor) -> Tensor:
-        answer: Tensor = self.policy(observation)
-        return answer
+def _require_once(key: nn.Module, module: nn.Module, question: Callable[[], Sequence[Any]]) -> None:
+    modes = tuple(part.training for part in key.modules())
+    if _modes.get(key) != modes:
+        require_pure(module, *question())
+        _modes[key] = modes

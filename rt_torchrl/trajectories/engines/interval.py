@@ -1,6 +1,7 @@
-"""One control interval as a differentiable map, and the protocol of the engines that chain it to trajectories."""
+"""One control interval as a differentiable map, what engines do with it, and the two plain engines of PyTorch."""
 
-from typing import ClassVar, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -95,26 +96,94 @@ def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor,
     return end
 
 
-class GradientEngine(Protocol):
-    """Computes differentiable trajectories of a plant, compiled or eager.
+def march(interval: Callable[[Tensor, Drive], Tensor], initial_state: Tensor, drive: Drive) -> Tensor:
+    """States at the end of every interval, ``n batch n_s``, by a loop."""
+    state, states = initial_state, []
+    for k in range(drive.t.shape[0]):
+        state = interval(state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
+        states.append(state)
+    return torch.stack(states)
+
+
+class GradientEngine:
+    """Computes differentiable trajectories of a plant.
 
     The options name an engine by its class, in small letters and with underscores.
+
+    Args:
+        compiled: compile by PyTorch what the engine leaves to it; without effect on most engines.
     """
 
-    own_scheme: ClassVar[bool]
-    """Whether the engine takes plants that step by a scheme of their own, see :attr:`Plant.own_scheme`."""
-    start_per_realisation: ClassVar[bool]
-    """Whether every realisation can have a start time of its own."""
+    exact: ClassVar[bool] = True
+    """Whether the engine differentiates the plant's own step. One that integrates the vector field takes no plant with
+    another scheme (:attr:`Plant.own_scheme`) or with early ends, and the same start for all realisations."""
 
-    def __init__(self, *, compiled: bool): ...
+    def __init__(self, *, compiled: bool = False):
+        pass
 
-    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable by weights, initial state and drive."""
-        ...
+        raise NotImplementedError
 
-    def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
+    def costs(self, interval: CostInterval, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """Means of the running cost over all intervals, ``batch``, differentiable; None if they follow from the states.
 
         An engine computes them itself if this is quicker than to differentiate the costs of all states.
         """
         return None
+
+
+class Autograd(GradientEngine):
+    """Backpropagation through every operation of every step; memory and time grow with the number of steps."""
+
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
+        return march(interval, initial_state, drive)
+
+
+class OdeintAdjoint(GradientEngine):
+    r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals: the paper's continuous adjoint.
+
+    The applied action and the exogenous input are constant components of the integrated state. The co-state of an
+    action is then :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, and ordinary backpropagation
+    carries it on into the policy. The co-state is integrated backwards with the step of the forward solution, so that
+    the gradient differs from the exact one of the discrete trajectory by the order of that step. Nothing is compiled:
+    torchdiffeq goes back several times through one graph, which compiled code refuses.
+    """
+
+    exact: ClassVar[bool] = False
+
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
+        from torchdiffeq import odeint_adjoint  # here, because it takes a second to load and only this engine needs it
+
+        assert isinstance(interval, Interval)  # a vector field alone can be integrated
+        plant, n_s = interval.plant, initial_state.shape[-1]
+        field = _HeldField(interval, n_s)
+        weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
+        interval_span = torch.tensor([0.0, plant.dt], dtype=torch.float64, device=drive.t.device)
+
+        def integrated(t: Tensor, state: Tensor, applied: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
+            held = torch.cat([state, applied, exogenous], -1)
+            # The span is in absolute time: the backward pass evaluates the field again, long after this call.
+            span = t + interval_span
+            return odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1, ..., :n_s]
+
+        def step(state: Tensor, now: Drive) -> Tensor:
+            command = interval.command(state, now)
+            return plant.step_by(integrated, now.t, state, command, now.exogenous, interval.closure).state
+
+        return march(step, initial_state, drive)
+
+
+class _HeldField(nn.Module):
+    """The vector field of the held state, d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
+
+    def __init__(self, interval: Interval, n_states: int):
+        super().__init__()
+        plant = interval.plant
+        self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs))
+        self.vector_field = plant.vector_field
+
+    def forward(self, t: Tensor, held: Tensor) -> Tensor:
+        state, action, exogenous = held.split(self.sizes, -1)
+        rate = self.vector_field(t, state, action, exogenous, self.closure)
+        return torch.cat([rate, torch.zeros_like(action), torch.zeros_like(exogenous)], -1)

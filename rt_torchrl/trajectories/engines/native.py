@@ -13,14 +13,13 @@ lanes are divided among the threads of torch.
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rt_torchrl.trajectories.engines.autograd import Autograd
 from rt_torchrl.trajectories.engines.code import (
     Group,
     Inputs,
@@ -30,12 +29,11 @@ from rt_torchrl.trajectories.engines.code import (
     require_pure_once,
     signals_of,
 )
-from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, GradientEngine, Interval
+from rt_torchrl.trajectories.engines.interval import Autograd, CostInterval, Drive, GradientEngine
 from rt_torchrl.trajectories.engines.parallel import Parallel
 
 MEMORY = 2.0**30
 """Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
-LEAST_MEMORY = 2.0**20
 
 Piece = tuple[slice, np.ndarray, np.ndarray]
 """Intervals with their states and ∂J/∂s at their ends (``n n_s lanes``, or one row that serves all)."""
@@ -50,20 +48,10 @@ class Native(GradientEngine):
 
     Args:
         compiled: whether the engine for other devices compiles.
-        memory: bytes that a sweep may hold.
-
-    Raises:
-        ValueError: if the memory is below a mebibyte.
     """
 
-    own_scheme: ClassVar[bool] = True
-    start_per_realisation: ClassVar[bool] = True
-
-    def __init__(self, *, compiled: bool, memory: float = MEMORY):
-        if not memory >= LEAST_MEMORY:
-            raise ValueError(f"memory={memory} bytes of engine 'native' must be at least {LEAST_MEMORY:.0f}.")
-        self.memory, self._compiled = memory, compiled
-        self._costed: CostInterval | None = None
+    def __init__(self, *, compiled: bool = False):
+        self._compiled = compiled
 
     @cached_property
     def _elsewhere(self) -> Parallel:
@@ -75,7 +63,7 @@ class Native(GradientEngine):
             require_pure_once(interval, initial_state, drive)
             return self._elsewhere.end_states(interval, initial_state, drive)
         found = self.own_end_states(interval, initial_state, drive)
-        return Autograd(compiled=False).end_states(interval, initial_state, drive) if found is None else found
+        return Autograd().end_states(interval, initial_state, drive) if found is None else found
 
     def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""
@@ -83,20 +71,18 @@ class Native(GradientEngine):
         ends: Tensor | None = None if task is None else _EndStates.apply(task, *task.leaves)
         return ends
 
-    def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
+    def costs(self, interval: CostInterval, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """Means of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
 
         Where a gradient is wanted, it is computed in the same sweep.
         """
-        if self._costed is None or self._costed.interval is not interval:
-            self._costed = CostInterval(interval)
-        task = self._task(self._costed, initial_state, drive)
+        task = self._task(interval, initial_state, drive)
         costs: Tensor | None = None if task is None else _Costs.apply(task, torch.is_grad_enabled(), *task.leaves)
         return costs
 
     def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
         found = code_of(interval, initial_state, drive)
-        return found and _Task(*found, initial_state, drive, self.memory)
+        return found and _Task(*found, initial_state, drive)
 
 
 class _Task:
@@ -107,17 +93,16 @@ class _Task:
         inputs: weights and buffers of the interval.
         initial_state: initial states; further states of the program begin with zero.
         drive: drive of all intervals.
-        memory: bytes that a sweep may hold.
     """
 
-    def __init__(self, code: IntervalCode, inputs: Inputs, initial_state: Tensor, drive: Drive, memory: float):
+    def __init__(self, code: IntervalCode, inputs: Inputs, initial_state: Tensor, drive: Drive):
         self.code, self.inputs, self.lanes = code, inputs, code.lanes.number
         self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row(code.read)
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
         self._signals = signals_of(self.drive)
         in_lanes = 16 * self.lanes * (code.sizes["s"] + code.sizes["x"])
-        length = max(1, int(memory / torch.get_num_threads() / in_lanes))
+        length = max(1, int(MEMORY / torch.get_num_threads() / in_lanes))
         self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
     def start(self, group: Group) -> np.ndarray:

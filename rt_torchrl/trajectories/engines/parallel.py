@@ -17,17 +17,16 @@ import sysconfig
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache, partial, reduce
-from itertools import pairwise
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 from weakref import WeakSet
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rt_torchrl.trajectories.engines.interval import Drive, GradientEngine, with_weights
+from rt_torchrl.trajectories.engines.interval import Drive, GradientEngine, march
 
 LIMITS = {
     # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
@@ -51,10 +50,7 @@ class Parallel(GradientEngine):
         compiled: compile the two recurrences, the Jacobians and the final product.
     """
 
-    own_scheme: ClassVar[bool] = True
-    start_per_realisation: ClassVar[bool] = True
-
-    def __init__(self, *, compiled: bool):
+    def __init__(self, *, compiled: bool = False):
         self.march = compiled_if(compiled, march_by_scan, march)
         self.linearise = compiled_if(compiled, linearise)
         self.costates = compiled_if(compiled, costates_by_scan, costates)
@@ -95,7 +91,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval, ()), starts, drive)
+        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval), starts, drive)
         sources = marked_dynamic(plain(cost_gradient), 1)
         costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
@@ -120,36 +116,23 @@ def _products(
     if not any(wanted):
         return [None] * len(wanted)
     rows, driven = as_one_batch(starts, drive)
-    found = []
-    for at in pieces(len(rows)):
-        states, driving = piece(rows, driven, at.start, at.stop)
-        inputs = [*driving, *weights]
+    number, found = -(-len(rows) // PIECE), []
+    parts = (x.chunk(number) for x in (rows, *driven, costates.flatten(0, 1)))
+    for states, t, exogenous, command, costate in zip(*parts, strict=True):
+        driving = Drive(*map(plain, (t, exogenous, command)))
         with torch.enable_grad():
             for x, need in zip(driving, wanted, strict=False):
                 marked_dynamic(x, 0).requires_grad_(need)
-            out = function(interval, marked_dynamic(states, 0), driving)
-        leaves = [x for x, need in zip(inputs, wanted, strict=True) if need]
-        found.append(torch.autograd.grad(out, leaves, costates.flatten(0, 1)[at], allow_unused=True))
+            out = function(interval, marked_dynamic(plain(states), 0), driving)
+        leaves = [x for x, need in zip((*driving, *weights), wanted, strict=True) if need]
+        found.append(torch.autograd.grad(out, leaves, costate, allow_unused=True, materialize_grads=True))
     gathered = iter(zip(*found, strict=True))
-    shape = starts.shape[:2]
-    of_drive = [_of_rows(next(gathered), shape, x) if need else None for x, need in zip(drive, wanted, strict=False)]
-    return of_drive + [_summed(next(gathered)) if need else None for need in wanted[len(drive) :]]
-
-
-def _of_rows(parts: Sequence[Tensor | None], shape: torch.Size, drive: Tensor) -> Tensor | None:
-    """The gradients of all rows in the shape of the drive, where t may be the same for all realisations."""
-    found = _known(parts)
-    return torch.cat(found).unflatten(0, shape).sum_to_size(drive.shape) if found else None
-
-
-def _summed(parts: Sequence[Tensor | None]) -> Tensor | None:
-    found = _known(parts)
-    return reduce(torch.add, found) if found else None
-
-
-def _known(parts: Sequence[Tensor | None]) -> list[Tensor]:
-    """Gradients of the pieces: all of them, or none for an input that the intervals do not depend on."""
-    return [part for part in parts if part is not None]
+    of_drive = [
+        # t may be the same for all realisations
+        torch.cat(next(gathered)).unflatten(0, starts.shape[:2]).sum_to_size(x.shape) if need else None
+        for x, need in zip(drive, wanted, strict=False)
+    ]
+    return of_drive + [sum(next(gathered)) if need else None for need in wanted[len(drive) :]]
 
 
 def _all_intervals(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
@@ -194,7 +177,7 @@ def require_forward_mode(interval: nn.Module, initial_state: Tensor, drive: Driv
         ValueError: if it cannot, such as that of attention; the message says why.
     """
     try:
-        linearise(interval, (), *as_one_batch(initial_state[None, :1], Drive(*(x[:1, :1] for x in drive))))
+        linearise(interval, *as_one_batch(initial_state[None, :1], Drive(*(x[:1, :1] for x in drive))))
     except Exception as error:
         said = next((line for line in str(error).splitlines() if line), type(error).__name__)
         raise ValueError(
@@ -222,25 +205,6 @@ def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
     return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
 
 
-def piece(rows: Tensor, drive: Drive, first: int, last: int) -> tuple[Tensor, Drive]:
-    """Rows ``first`` to ``last`` − 1 in memory of their own.
-
-    The compiler traces a view together with the tensor behind it. Behind the rows is a tensor ``n batch ...`` with two
-    unknown sizes, of which the compiler finds only the product; it then gives up.
-    """
-    return plain(rows[first:last]), Drive(*(plain(x[first:last]) for x in drive))
-
-
-def pieces(count: int) -> list[slice]:
-    """Cut ``count`` rows into as few pieces as :data:`PIECE` allows, with lengths that differ by one at most.
-
-    No piece is left with a single row, for which the compiler would trace again.
-    """
-    number = -(-count // PIECE)
-    ends = [count * k // number for k in range(number + 1)]
-    return [slice(*pair) for pair in pairwise(ends)]
-
-
 def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
     """``function`` of every interval, ``n batch ...``, in pieces of which the last one may overlap another.
 
@@ -252,64 +216,29 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
     rows, driven = as_one_batch(starts, drive)
     length = min(PIECE, len(rows))
     firsts = [*range(0, len(rows) - length, length), len(rows) - length]
-    found = [function(*piece(rows, driven, first, first + length)) for first in firsts]
+    # In memory of their own: the compiler traces a view together with the tensor behind it, ``n batch ...`` with two
+    # unknown sizes, of which it finds only the product; it then gives up.
+    parts = [[plain(x[first : first + length]) for x in (rows, *driven)] for first in firsts]
+    found = [function(states, Drive(*driving)) for states, *driving in parts]
     found[-1] = found[-1][len(found) * length - len(rows) :]
     return torch.cat(found).unflatten(0, starts.shape[:2])
 
 
-def linearise(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column.
-
-    Args:
-        interval: the map Φ.
-        names: names of the weights w of its closure; without names the result is ∂Φ/∂s alone.
-        starts: states at the starts of the intervals, ``rows n_s``.
-        drive: times and inputs of the intervals.
-    """
-    weights = tuple(interval.get_parameter(f"closure.{name}") for name in names)
-    sizes = [starts.shape[-1], *(w.numel() for w in weights)]
-    basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
-
-    def end(state: Tensor, *values: Tensor) -> Tensor:
-        replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
-        return with_weights(interval, replaced, state, drive)
+def linearise(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
+    """∂Φ/∂s at every interval, ``rows n_s n_s``, by a forward-mode product for each column."""
+    basis = torch.eye(starts.shape[-1], dtype=starts.dtype, device=starts.device)
 
     def column(direction: Tensor) -> Tensor:
-        by_state, *by_weights = direction.split(sizes)
-        tangents = (part.reshape(w.shape) for part, w in zip(by_weights, weights, strict=True))
-        return torch.func.jvp(end, (starts, *weights), (by_state.expand_as(starts), *tangents))[1]
+        return torch.func.jvp(lambda state: interval(state, drive), (starts,), (direction.expand_as(starts),))[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
-
-
-def linearise_by_rows(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """The result of :func:`linearise` by a reverse-mode product for each row: less work where n_w is far above n_s."""
-    weights = {f"closure.{name}": interval.get_parameter(f"closure.{name}").detach() for name in names}
-
-    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
-        return with_weights(interval, values, state, Drive(*drive))
-
-    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
-    by_state, by_weights = rows(weights, starts, *drive)
-    # A weight may be one number, of no dimension.
-    parts = (jacobian.reshape(*by_state.shape[:2], -1) for jacobian in by_weights.values())
-    return torch.cat([by_state, *parts], -1)
 
 
 # The recurrence of the states
 
 
-def march(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
-    """States at the end of every interval, ``n batch n_s``, by a loop."""
-    state, states = initial_state, []
-    for k in range(drive.t.shape[0]):
-        state = interval(state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
-        states.append(state)
-    return torch.stack(states)
-
-
 def march_by_scan(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
-    """The states of :func:`march` by one ``scan``, for the compiler."""
+    """The states of :func:`~rt_torchrl.trajectories.engines.interval.march` by one ``scan``, for the compiler."""
     from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
 
     def body(state: Tensor, x: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
