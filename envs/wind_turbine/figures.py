@@ -44,7 +44,8 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     wind, speed, power, torque, pitch = axes
 
     def draw(ax: Axes, values: Tensor, label: str, **look: Any) -> None:
-        ax.plot(time[:-1], array(values), label=label, **{"color": REAL, "linewidth": 1.5} | look)
+        usual: dict[str, Any] = {"color": REAL, "linewidth": 1.5}
+        ax.plot(time[:-1], array(values), label=label, **usual | look)
 
     draw(wind, record.exogenous[:, 0], "wind", linewidth=0.9)
     draw(wind, state[:, 2], "filtered", color=FILTERED, linewidth=2.0)
