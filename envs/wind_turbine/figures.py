@@ -68,7 +68,7 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 
 @torch.no_grad()
 def power_coefficient(snapshot: Snapshot) -> Figure:
-    """C_p over λ and β: the true table, the learned law beside it, and their difference (paper, fig. 14b).
+    """C_p over λ and β: the true table, the learned law beside it, and their difference.
 
     Dots are operating points of the last episode, because a twin can only know what was visited. The colours of the
     difference end at ``GREATEST_SHOWN``, which they reach far from the dots.
