@@ -61,7 +61,7 @@ def tank(snapshot: Snapshot) -> Figure:
     figure, axes, time = style.timeline(plant, len(record.actions), len(real) + 1, title=title, size=(9.5, 12.0))
     time, (*of_tank, load) = time[:-1], axes
     target, half = 1e-3 * plant.set_point, 1e-3 * BAND
-    band = {"color": style.REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
+    band: dict[str, Any] = {"color": style.REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
     axes[0].axhspan(target - half, target + half, **band)
     axes[0].axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
     for ax, (name, values) in zip(of_tank, real.items(), strict=True):
@@ -123,7 +123,7 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     for ax in (heat, held):
         style.veil(ax, kilopascal := 1e-3 * array(drop), (kilopascal >= visited.min()) & (kilopascal <= visited.max()))
     weight = np.full(len(visited), 100.0 / len(visited))
-    share.hist(visited, np.linspace(0.0, 1e-3 * plant.actions[0].high, 41), weights=weight, color=SAMPLES)
+    share.hist(visited, np.linspace(0.0, 1e-3 * plant.actions[0].high, 41).tolist(), weights=weight, color=SAMPLES)
     caption(heat, "heat taken by the exchanger $Q_{HX}$ [W]")
     caption(held, "load at which the pressure stands still [W]", f"mean load {mean:.3g} W")
     caption(share, "share of the last episode [%] per 5 kPa")

@@ -175,7 +175,7 @@ def polars(snapshot: Snapshot) -> Figure:
         # An edge borders on two bins.
         style.veil(axes[k], edges, np.append(filled, False) | np.append(False, filled))
     share = np.full(len(visited), 100.0 / len(visited))
-    axes[2].hist(np.degrees(np.arctan2(*array(visited).T)), edges, weights=share, color=SAMPLES)
+    axes[2].hist(np.degrees(np.arctan2(*array(visited).T)), edges.tolist(), weights=share, color=SAMPLES)
     caption(axes[2], f"share of the flight [%] per {BIN:g} deg at {SPAN_SHARE:.0%} of the span")
     axes[2].set_xticks(np.arange(-180, 181, 45))
     axes[2].set_xlim(-180.0, 180.0)
@@ -247,7 +247,7 @@ def scene(snapshot: Snapshot) -> Scene:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         ax.set_xlabel(plant.states[0].label)
         ax.set_ylabel(plant.states[1].label)
-        bar = {"solid_capstyle": "round"}
+        bar: dict[str, Any] = {"solid_capstyle": "round"}
         (trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
         (plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
         (normal,) = ax.plot([], [], color="0.45", linewidth=1.5, label="normal")

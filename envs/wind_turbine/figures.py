@@ -44,7 +44,8 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     wind, speed, power, torque, pitch = axes
 
     def draw(ax: Axes, values: Tensor, label: str, **look: Any) -> None:
-        ax.plot(time[:-1], array(values), label=label, **{"color": REAL, "linewidth": 1.5} | look)
+        usual: dict[str, Any] = {"color": REAL, "linewidth": 1.5}
+        ax.plot(time[:-1], array(values), label=label, **usual | look)
 
     draw(wind, record.exogenous[:, 0], "wind", linewidth=0.9)
     draw(wind, state[:, 2], "filtered", color=FILTERED, linewidth=2.0)
@@ -67,7 +68,7 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 
 @torch.no_grad()
 def power_coefficient(snapshot: Snapshot) -> Figure:
-    """C_p over λ and β: the true table, the learned law beside it, and their difference (paper, fig. 14b).
+    """C_p over λ and β: the true table, the learned law beside it, and their difference.
 
     Dots are operating points of the last episode, because a twin can only know what was visited. The colours of the
     difference end at ``GREATEST_SHOWN``, which they reach far from the dots.

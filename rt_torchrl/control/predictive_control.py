@@ -409,7 +409,7 @@ class PredictiveControl(nn.Module):
             records: inputs of whole episodes.
         """
         plant = self._plant[0]
-        if isinstance(self.forecast, Held) or not plant.inputs:
+        if not isinstance(self.forecast, Decaying | Scattered) or not plant.inputs:
             return
         over = {"dt": plant.dt, "horizon": min(self._acting.horizon, records.shape[1] - 1) * plant.dt}
         fitted: Decaying | Scattered = Decaying.fitted(records, **over)

@@ -63,7 +63,7 @@ def _curves(snapshot: Snapshot) -> Figure:
     for ax, action in zip(axes, plant.actions, strict=True):
         style.limits(ax, action)
         ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-        rug = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
+        rug: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
         ax.plot(shown, np.full_like(shown, 0.02), "|", label="visited", **rug)
         caption(ax, action.label)
     axes[0].set_xlim(axis[0].item(), axis[-1].item())
