@@ -48,7 +48,7 @@ from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.log import LogConfig, read_log
-from .fit.record import SensorRecord, sensor_record
+from .fit.sensors import SensorRecord, sensor_record
 from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty
 

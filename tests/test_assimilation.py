@@ -12,8 +12,7 @@ from torch import nn
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation
-from rt_torchrl.fit.record import sensor_record
-from rt_torchrl.fit.sensors import sensors_of, state_sensors
+from rt_torchrl.fit.sensors import sensor_record, sensors_of, state_sensors
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.rollout import Rollout

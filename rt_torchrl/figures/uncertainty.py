@@ -91,26 +91,6 @@ def correlations(uncertainty: Uncertainty) -> Figure:
     return figure
 
 
-def ellipses(uncertainty: Uncertainty, *, level: float = 0.95) -> Figure:
-    """Joint confidence regions of all pairs of a closure's values, which are few; none where the data say nothing."""
-    names, untold = uncertainty.names, set(uncertainty.unknown())
-    n = max(len(names) - 1, 1)
-    title = f"Joint {level:.0%} regions of the weights"
-    figure, axes = panels(n, n, title=title, size=(2.2 * n + 1.0, 2.2 * n + 0.8))
-    for i in range(n):
-        for j in range(n):
-            ax, pair = axes[i, j], (names[j], names[i + 1]) if len(names) > 1 else (names[0], names[0])
-            if j > i:
-                ax.set_axis_off()
-                continue
-            if not untold & set(pair):
-                ax.plot(*array(uncertainty.ellipse(*pair, level=level)).T, color=TWIN)
-            ax.plot(*(uncertainty.values[names.index(name)].item() for name in pair), "+", color=REAL)
-            ax.set_xlabel(pair[0] if i == n - 1 else "")
-            ax.set_ylabel(pair[1] if j == 0 else "")
-    return figure
-
-
 def curve(band: Band, *, xlabel: str, ylabel: str, data: np.ndarray, true: np.ndarray | None = None) -> Figure:
     """A learned curve with its pointwise interval, where data was, and the true curve if it is known.
 

@@ -18,6 +18,7 @@ Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (
 """
 
 import math
+from statistics import NormalDist
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -33,17 +34,8 @@ BAD_SHARE = 0.5
 """Standard error of a value, as a share of the value, above which the data hardly tell it."""
 HIGH_CORRELATION = 0.99
 """Correlation of two values above which the data tell only one combination of them."""
-
-
 LEAST_EIGENVALUE = 1e-12
 """Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
-
-
-class Interval(NamedTuple):
-    """Ends of a confidence interval."""
-
-    low: float
-    high: float
 
 
 class Uncertainty:
@@ -89,11 +81,6 @@ class Uncertainty:
         """Covariance of the closure's named values."""
         return self._slopes @ self.weights_covariance @ self._slopes.T
 
-    @property
-    def _free(self) -> Float[Tensor, "n_named n_null"]:
-        """Changes of the named values in the directions of which nothing is known."""
-        return self._slopes @ self.null[: self.likelihood.weight_count]
-
     def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the data say nothing.
 
@@ -117,34 +104,15 @@ class Uncertainty:
         scale = torch.where(self.untold(self._slopes), math.nan, C.diagonal().sqrt())
         return C / torch.outer(scale, scale)
 
-    def intervals(self, level: float = 0.95) -> dict[str, Interval]:
-        """Confidence interval of every named value.
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Ends of the confidence interval of every named value.
 
         Raises:
             ValueError: if the level does not lie between 0 and 1.
         """
         factor = normal_factor(level)
         found = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
-        return {name: Interval(value - factor * error, value + factor * error) for (name, error), value in found}
-
-    def ellipse(self, first: str, second: str, *, level: float = 0.95, points: int = 100) -> Float[Tensor, "points 2"]:
-        """Boundary of the joint confidence region of two named values.
-
-        Raises:
-            ValueError: if a name does not exist, the data say nothing of a value, or the level does not lie between 0
-                and 1.
-        """
-        unknown = [name for name in (first, second) if name not in self.names]
-        if unknown:
-            raise ValueError(f"ellipse of {unknown}: the closure's values are {', '.join(self.names)}.")
-        if untold := sorted({first, second} & set(self.unknown())):
-            raise ValueError(f"ellipse of {untold}: it has no end, as the data say nothing of them; choose others.")
-        pair = torch.tensor([self.names.index(first), self.names.index(second)])
-        values, vectors = torch.linalg.eigh(self.named_covariance[pair[:, None], pair])
-        radius = math.sqrt(-2.0 * math.log(1.0 - _level(level)))  # the quantile of χ² with two degrees of freedom
-        angle = torch.linspace(0.0, 2.0 * math.pi, points, dtype=torch.float64)
-        circle = torch.stack([angle.cos(), angle.sin()], -1)
-        return self.values[pair] + radius * (circle * values.clamp_min(0.0).sqrt()) @ vectors.T
+        return {name: (value - factor * error, value + factor * error) for (name, error), value in found}
 
     def initial_errors(self) -> Float[Tensor, "records n_s"]:
         """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
@@ -176,7 +144,8 @@ class Uncertainty:
         if not names:
             return []
         # The rank must not depend on the units of values and weights.
-        free = self._free[[self.names.index(name) for name in names]]
+        slopes = self._slopes[[self.names.index(name) for name in names]]
+        free = slopes @ self.null[: self.likelihood.weight_count]
         for dim in (1, 0):
             free = normalize(free, dim=dim, eps=1e-300)
         rank = int(torch.linalg.matrix_rank(free, rtol=1e-3))
@@ -201,13 +170,9 @@ def normal_factor(level: float) -> float:
     Raises:
         ValueError: if the probability does not lie between 0 and 1.
     """
-    return float(torch.special.ndtri(torch.tensor(0.5 + 0.5 * _level(level), dtype=torch.float64)))
-
-
-def _level(level: float) -> float:
     if not 0.0 < level < 1.0:
-        raise ValueError(f"level={level} of a confidence region must lie between 0 and 1.")
-    return level
+        raise ValueError(f"level={level} of a confidence interval must lie between 0 and 1.")
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
 class InverseInformation(NamedTuple):
@@ -292,33 +257,6 @@ class Band(NamedTuple):
     low: Float[Tensor, " points"]
     high: Float[Tensor, " points"]
 
-    def covers(self, true: Float[Tensor, " points"]) -> float:
-        """Share of the points at which the interval holds the true curve."""
-        return ((true >= self.low) & (true <= self.high)).double().mean().item()
-
-
-def scatter(
-    closure: nn.Module, features: Float[Tensor, "points n_f"], uncertainty: Uncertainty
-) -> tuple[Float[Tensor, "points n_c"], Float[Tensor, "points n_c"]]:
-    """What a closure says of features, and the standard deviation of it; infinite where the data say nothing.
-
-    Args:
-        closure: the closure.
-        features: features at which it is asked.
-        uncertainty: uncertainty of the closure's trained weights, in the order of ``parameters()``.
-    """
-    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
-
-    def said(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-        found: Tensor = torch.func.functional_call(closure, weights, (x,))
-        return found
-
-    jacobians = torch.func.vmap(torch.func.jacrev(said), in_dims=(None, 0))(trained, features)
-    J = torch.cat([jacobian.flatten(2) for jacobian in jacobians.values()], -1)
-    variance = torch.einsum("pcw,wv,pcv->pc", J, uncertainty.weights_covariance, J)
-    with torch.no_grad():
-        return closure(features), torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
-
 
 def band(
     uncertainty: Uncertainty,
@@ -328,7 +266,7 @@ def band(
     output: int = 0,
     level: float = 0.95,
 ) -> Band:
-    """The interval of one output of the estimated closure along a line of features.
+    """The interval of one output of the estimated closure along a line of features; without end where data say nothing.
 
     Args:
         uncertainty: uncertainty of the estimate.
@@ -341,7 +279,15 @@ def band(
         ValueError: if the level does not lie between 0 and 1.
     """
     closure = uncertainty.likelihood.twin.closure
-    said, deviation = scatter(closure, features, uncertainty)
-    half = normal_factor(level) * deviation[:, output]
-    middle = said[:, output]
+    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
+
+    def value(weights: dict[str, Tensor], point: Tensor) -> Tensor:
+        outputs: Tensor = torch.func.functional_call(closure, weights, (point,))
+        return outputs[..., output]
+
+    slopes = torch.func.vmap(torch.func.jacrev(value), in_dims=(None, 0))(trained, features)
+    J = torch.cat([slope.flatten(1) for slope in slopes.values()], -1)
+    variance = ((J @ uncertainty.weights_covariance) * J).sum(-1)
+    deviation = torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
+    half, middle = normal_factor(level) * deviation, value(trained, features).detach()
     return Band(x, middle, middle - half, middle + half)
