@@ -11,6 +11,9 @@ and noise that differs between samples:
     M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \qquad
     \Gamma_l = \sum_kg_kg_{k+l}^\top
 
+Residuals are orthogonal to their derivatives, so that M of a short record is too small: it is multiplied by n/(n − p),
+for n samples and p unknowns, and no combination of the unknowns is told better than by white noise of their size.
+
 Named values of the closure, and points of its curve, take their errors from those of the weights to first order. Both
 formulas assume that the physics is right: an error that no weights can remove is bias, and no record shows its size.
 
@@ -60,12 +63,17 @@ class Uncertainty:
         self._inverse = inverse_information(self.information)
         self.covariance, self.null = self._inverse.matrix, self._inverse.null
         if errors == "robust":
-            M = torch.zeros_like(self.information)
+            M, samples = torch.zeros_like(self.information), 0
             for block in blocks:
                 every = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
                 for scores, seen, places in zip(every, block.seen.any(-1), block.places, strict=True):
                     M[places[:, None], places] += newey_west(scores[seen])
-            self.covariance = self.covariance @ M @ self.covariance
+                    samples += int(seen.sum())
+            root = self._inverse.root
+            ratios, vectors = torch.linalg.eigh(root.T @ M @ root * (samples / max(samples - root.shape[1], 1)))
+            root, squares = root @ vectors, sum(float(block.values.square().sum()) for block in blocks)
+            white = squares / max(int(likelihood.samples.sum()) - root.shape[1], 1)
+            self.covariance = (root * ratios.clamp_min(white)) @ root.T
         closure = likelihood.twin.closure
         self.names, self._slopes = named_slopes(closure)
         self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
@@ -176,16 +184,21 @@ def normal_factor(level: float) -> float:
 
 
 class InverseInformation(NamedTuple):
-    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns.
+    """The pseudo-inverse RRᵀ of an information matrix, and the directions of which the matrix says nothing, in columns.
 
     The pseudo-inverse is that of the matrix scaled to unit diagonal, so that it does not depend on the units of the
     unknowns. A direction is one long in these scales. ``silent`` marks unknowns of which the matrix says nothing
     whatever the others are; they have no scale.
     """
 
-    matrix: Float[Tensor, "n n"]
+    root: Float[Tensor, "n n_shown"]
     null: Float[Tensor, "n n_null"]
     silent: Bool[Tensor, " n"]
+
+    @property
+    def matrix(self) -> Float[Tensor, "n n"]:
+        """The pseudo-inverse itself."""
+        return self.root @ self.root.T
 
     def unknown(self, slopes: Float[Tensor, "*quantities n"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the matrix says nothing.
@@ -210,8 +223,8 @@ def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
     shown = values > LEAST_EIGENVALUE
     every = torch.eye(len(H), dtype=H.dtype, device=H.device)
     directions = every[:, seen] @ (vectors / unit[:, None])
-    inverse = (directions[:, shown] / values[shown]) @ directions[:, shown].T
-    return InverseInformation(inverse, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
+    root = directions[:, shown] / values[shown].sqrt()
+    return InverseInformation(root, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
