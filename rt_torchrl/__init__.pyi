@@ -49,7 +49,7 @@ from .control.predictive_control import PredictiveConfig, PredictiveControl, Rec
 from .evaluation.limits import LimitConfig
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.log import LogConfig, read_log
-from .fit.record import SensorRecord, sensor_record
+from .fit.sensors import SensorRecord, sensor_record
 from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty
 

@@ -4,8 +4,7 @@ import math
 
 import torch
 
-from rt_torchrl.fit.record import sensor_record
-from rt_torchrl.fit.sensors import sensors_of
+from rt_torchrl.fit.sensors import sensor_record, sensors_of
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal

@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -30,7 +31,9 @@ from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.checks import visited_features
-from rt_torchrl.fit.uncertainty import band, named_values
+from rt_torchrl.fit.log import SensorLog, checked
+from rt_torchrl.fit.resampling import filled, initial_spread, logged_readings, resample
+from rt_torchrl.fit.uncertainty import Band, band, named_values
 from rt_torchrl.plants.signal import bounds
 
 Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
@@ -47,12 +50,14 @@ class Coverage(NamedTuple):
     Args:
         names: names of the values.
         inside: share of the simulations in which the 95 % interval holds the truth, of those with an interval.
+        inside_68: the same for the 68 % interval, which is one standard error wide on each side.
         told: share of the simulations in which the data tell the value, so that it has an interval.
         error_over_bound: RMS error over the RMS standard error, which is the Cramér-Rao bound.
     """
 
     names: list[str]
     inside: Tensor
+    inside_68: Tensor
     told: Tensor
     error_over_bound: Tensor
 
@@ -108,9 +113,73 @@ def coverage(
 
 def _counted(names: list[str], errors: Tensor, scatter: Tensor) -> Coverage:
     z, known = errors / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
-    inside = torch.where(known, (z.abs() <= 1.959964).double(), torch.nan).nanmean(0)
+    inside, inside_68 = (
+        torch.where(known, (z.abs() <= width).double(), torch.nan).nanmean(0) for width in (1.959964, 0.994458)
+    )
     ratio = torch.where(known, z, torch.nan).square().nanmean(0).sqrt()
-    return Coverage(names, inside, known.double().mean(0), ratio)
+    return Coverage(names, inside, inside_68, known.double().mean(0), ratio)
+
+
+class Logging(NamedTuple):
+    """How a flight is logged.
+
+    Args:
+        every: number of control intervals between two rows, of which commands are held for a multiple.
+        dropped: share of the rows that hold a value that is missing, and are left out.
+        missing: share of the samples that single sensors lack.
+        noise: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
+    """
+
+    every: int = 1
+    dropped: float = 0.0
+    missing: float = 0.0
+    noise: float = 0.01
+
+
+def log_of(
+    plant: Plant, flown: Trajectory, sensors: Sequence[Sensor], logging: Logging, generator: torch.Generator
+) -> SensorLog:
+    """The log of a flight, whose rows hold noisy readings, commands and inputs."""
+    (record,) = with_noise([sensor_record(plant, sensors, flown)], logging.noise, generator)
+    rows = slice(0, None, logging.every)
+    held = [torch.cat([values, values[-1:]])[rows] for values in (flown.actions, flown.exogenous)]
+    readings = record.readings[rows].clone()
+    lacking = torch.rand(readings.shape, generator=generator, dtype=torch.float64) < logging.missing
+    readings[lacking] = torch.nan
+    bad = torch.rand(len(readings), generator=generator, dtype=torch.float64) < logging.dropped
+    bad[[0, -1]] = False
+    signals = (*plant.actions, *plant.acting_inputs)
+    columns = dict(zip((s.name for s in signals), torch.cat(held, -1).T.numpy(), strict=False))
+    columns[plant.actions[0].name] = np.where(bad.numpy(), np.nan, columns[plant.actions[0].name])
+    columns |= {sensor.name: values.numpy() for sensor, values in zip(sensors, readings.T, strict=True)}
+    log = SensorLog(times=plant.dt * logging.every * np.arange(len(readings)), columns=columns)
+    return checked(log, plant, drop=True, missing=True)
+
+
+def logged_coverage(
+    plant: Plant,
+    closure: nn.Module,
+    sensors: Sequence[Sensor],
+    logging: Logging,
+    *,
+    simulations: int,
+    generator: torch.Generator,
+    config: EstimationConfig,
+) -> Coverage:
+    """As :func:`coverage`, from a log, as ``recipes/identify.py`` reads it."""
+    truth = torch.stack(list(named_values(closure).values())).detach()
+    twin, errors, scatter = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True)), [], []
+    start = copy.deepcopy(twin.closure.state_dict())
+    for _ in range(simulations):
+        flown = random_flight(plant, closure, generator)
+        log = log_of(plant, flown, sensors, logging, generator)
+        parts = resample(filled(log, plant), plant)
+        records = [logged_readings(log, plant, tuple(sensors), part, parts.gap) for part in parts.segments]
+        twin.closure.load_state_dict(start)
+        found = Estimation(twin, sensors, spread=initial_spread(plant, log), config=config).run(records)
+        errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
+        scatter.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
+    return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(scatter))
 
 
 def curve_coverage(
@@ -152,8 +221,13 @@ def curve_coverage(
         points = every[:: max(1, len(every) // POINTS)]
         seen = band(estimate.uncertainty, torch.arange(len(points)).double(), points, output=output)
         with torch.no_grad():
-            found.append(seen.covers(plant.closure(points)[:, output]))
+            found.append(covered(seen, plant.closure(points)[:, output]))
     return torch.tensor(found, dtype=torch.float64)
+
+
+def covered(drawn: Band, true: Tensor) -> float:
+    """Share of the points at which the interval holds the true curve."""
+    return ((true >= drawn.low) & (true <= drawn.high)).double().mean().item()
 
 
 def fly(plant: Plant, closure: nn.Module, generator: torch.Generator, flights: Flights | None) -> list[Trajectory]:
@@ -239,6 +313,15 @@ CASES: dict[str, Case] = {
     "pendulum": Case(lambda: Pendulum(horizon=5.0), lambda plant: plant.closure, ("angle", "angular_speed")),
 }
 """The simulations, by the plant's name."""
+
+
+LOGS: dict[str, tuple[str, tuple[str, ...], Logging]] = {
+    "coarse": ("pendulum", ("angle", "angular_speed"), Logging(every=5)),
+    "dropped": ("pendulum", ("angle", "angular_speed"), Logging(dropped=0.05)),
+    "partial": ("pendulum", ("angle",), Logging(missing=0.3)),
+    "coarse, partial, dropped": ("cascaded_tanks", ("sensed_level",), Logging(every=5, dropped=0.02, missing=0.1)),
+}
+"""Plant, sensors and logging of the simulated logs."""
 
 
 class CurveCase(NamedTuple):

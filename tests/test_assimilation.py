@@ -12,19 +12,14 @@ from torch import nn
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation
-from rt_torchrl.fit.record import sensor_record
-from rt_torchrl.fit.sensors import sensors_of, state_sensors
+from rt_torchrl.fit.sensors import sensor_record, sensors_of, state_sensors
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
 from rt_torchrl.trajectories.twin import DigitalTwin, Sensitivities
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.steps.inputs import ExogenousProcess
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 

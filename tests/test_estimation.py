@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hidden_wall import Envelope, Room, room_records
+from hidden_wall import Envelope, room_records
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from straight_line import Line, Slope, flown, line_segment, noise_of
@@ -14,8 +14,15 @@ from test_uncertainty import position
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, first_noise
-from rt_torchrl.fit.record import segments, sensor_record, usual_initial_state
-from rt_torchrl.fit.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
+from rt_torchrl.fit.sensors import (
+    Sensor,
+    known_sensors,
+    read,
+    read_slopes,
+    segments,
+    sensor_record,
+    sensors_of,
+)
 from rt_torchrl.plants.signal import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -163,7 +170,7 @@ def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
 )
 def test_states_and_measurements_of_a_plant_are_sensors(kind, name):
     plant = kind()
-    state = usual_initial_state(plant)[None]
+    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
     (found,) = read(sensors_of(plant, [name]), plant, torch.zeros(1).double(), state, torch.ones(1, 1).double())[0]
     names = [signal.name for signal in plant.states]
     expected = state[0, names.index(name)].item() if name in names else 5.0  # the way from the origin to the target
@@ -185,11 +192,6 @@ def test_what_cannot_be_estimated_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
-
-
-def test_the_usual_initial_state_is_the_mean_of_draws():
-    found = usual_initial_state(Room())
-    assert (found - 20.0).abs().max() < 4 * 3.0 / math.sqrt(100)
 
 
 def test_the_example_of_the_documentation_runs():

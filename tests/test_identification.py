@@ -19,9 +19,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
 from rt_torchrl.fit.log import SensorLog, checked
-from rt_torchrl.fit.record import sensor_record, sensor_records
 from rt_torchrl.fit.resampling import filled, hold_out, initial_spread, logged_readings, resample, sensors_in
-from rt_torchrl.fit.sensors import sensors_of, state_sensors
+from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal

@@ -25,8 +25,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
-from rt_torchrl.fit.record import SensorRecord, segments
-from rt_torchrl.fit.sensors import Sensor, state_places
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import check_options

@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from rt_torchrl.fit.record import SensorRecord, held_to_the_end
-from rt_torchrl.fit.sensors import Sensor, read, read_slopes, state_places
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, held_to_the_end, read, read_slopes, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant

@@ -20,8 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.fit.log import SensorLog, logged_states
-from rt_torchrl.fit.record import SensorRecord, usual_initial_state
-from rt_torchrl.fit.sensors import Sensor, known_sensors, sensors_of
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, known_sensors, sensors_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -30,6 +29,8 @@ GAP_INTERVALS = 3.0
 """Number of sampling intervals after which a pause counts as a gap, unless a limit is given."""
 INTERVALS_PER_ROW = 50
 """Greatest number of control intervals for each row of a log; with more, its time probably has another unit."""
+DRAWS = 100
+"""Number of initial states of a plant whose mean is the guess of a hidden one."""
 ROUNDING = 1e-6
 """Share of an interval by which an instant may miss the grid."""
 
@@ -238,7 +239,8 @@ def filled(log: SensorLog, plant: Plant, guesses: Mapping[str, float] | None = N
             raise ValueError(f"column {name!r} of the log holds no number; leave it out.")
         columns[name] = values if seen.all() else np.interp(log.times, log.times[seen], values[seen])
     if hidden:
-        usual = dict(zip((state.name for state in plant.states), usual_initial_state(plant).tolist(), strict=True))
+        drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0)).mean(0)
+        usual = dict(zip((state.name for state in plant.states), drawn.tolist(), strict=True))
         columns |= {name: np.full(len(log.times), guesses.get(name, usual[name])) for name in hidden}
     return replace(log, columns=columns)
 

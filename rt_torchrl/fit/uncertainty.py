@@ -11,6 +11,9 @@ and noise that differs between samples:
     M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \qquad
     \Gamma_l = \sum_kg_kg_{k+l}^\top
 
+Residuals are orthogonal to their derivatives, so that M of a short record is too small: it is multiplied by n/(n − p),
+for n samples and p unknowns, and no combination of the unknowns is told better than by white noise of their size.
+
 Named values of the closure, and points of its curve, take their errors from those of the weights to first order. Both
 formulas assume that the physics is right: an error that no weights can remove is bias, and no record shows its size.
 
@@ -18,6 +21,7 @@ Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (
 """
 
 import math
+from statistics import NormalDist
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -33,17 +37,8 @@ BAD_SHARE = 0.5
 """Standard error of a value, as a share of the value, above which the data hardly tell it."""
 HIGH_CORRELATION = 0.99
 """Correlation of two values above which the data tell only one combination of them."""
-
-
 LEAST_EIGENVALUE = 1e-12
 """Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
-
-
-class Interval(NamedTuple):
-    """Ends of a confidence interval."""
-
-    low: float
-    high: float
 
 
 class Uncertainty:
@@ -68,12 +63,17 @@ class Uncertainty:
         self._inverse = inverse_information(self.information)
         self.covariance, self.null = self._inverse.matrix, self._inverse.null
         if errors == "robust":
-            M = torch.zeros_like(self.information)
+            M, samples = torch.zeros_like(self.information), 0
             for block in blocks:
                 every = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
                 for scores, seen, places in zip(every, block.seen.any(-1), block.places, strict=True):
                     M[places[:, None], places] += newey_west(scores[seen])
-            self.covariance = self.covariance @ M @ self.covariance
+                    samples += int(seen.sum())
+            root = self._inverse.root
+            ratios, vectors = torch.linalg.eigh(root.T @ M @ root * (samples / max(samples - root.shape[1], 1)))
+            root, squares = root @ vectors, sum(float(block.values.square().sum()) for block in blocks)
+            white = squares / max(int(likelihood.samples.sum()) - root.shape[1], 1)
+            self.covariance = (root * ratios.clamp_min(white)) @ root.T
         closure = likelihood.twin.closure
         self.names, self._slopes = named_slopes(closure)
         self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
@@ -88,11 +88,6 @@ class Uncertainty:
     def named_covariance(self) -> Float[Tensor, "n_named n_named"]:
         """Covariance of the closure's named values."""
         return self._slopes @ self.weights_covariance @ self._slopes.T
-
-    @property
-    def _free(self) -> Float[Tensor, "n_named n_null"]:
-        """Changes of the named values in the directions of which nothing is known."""
-        return self._slopes @ self.null[: self.likelihood.weight_count]
 
     def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the data say nothing.
@@ -117,34 +112,15 @@ class Uncertainty:
         scale = torch.where(self.untold(self._slopes), math.nan, C.diagonal().sqrt())
         return C / torch.outer(scale, scale)
 
-    def intervals(self, level: float = 0.95) -> dict[str, Interval]:
-        """Confidence interval of every named value.
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Ends of the confidence interval of every named value.
 
         Raises:
             ValueError: if the level does not lie between 0 and 1.
         """
         factor = normal_factor(level)
         found = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
-        return {name: Interval(value - factor * error, value + factor * error) for (name, error), value in found}
-
-    def ellipse(self, first: str, second: str, *, level: float = 0.95, points: int = 100) -> Float[Tensor, "points 2"]:
-        """Boundary of the joint confidence region of two named values.
-
-        Raises:
-            ValueError: if a name does not exist, the data say nothing of a value, or the level does not lie between 0
-                and 1.
-        """
-        unknown = [name for name in (first, second) if name not in self.names]
-        if unknown:
-            raise ValueError(f"ellipse of {unknown}: the closure's values are {', '.join(self.names)}.")
-        if untold := sorted({first, second} & set(self.unknown())):
-            raise ValueError(f"ellipse of {untold}: it has no end, as the data say nothing of them; choose others.")
-        pair = torch.tensor([self.names.index(first), self.names.index(second)])
-        values, vectors = torch.linalg.eigh(self.named_covariance[pair[:, None], pair])
-        radius = math.sqrt(-2.0 * math.log(1.0 - _level(level)))  # the quantile of χ² with two degrees of freedom
-        angle = torch.linspace(0.0, 2.0 * math.pi, points, dtype=torch.float64)
-        circle = torch.stack([angle.cos(), angle.sin()], -1)
-        return self.values[pair] + radius * (circle * values.clamp_min(0.0).sqrt()) @ vectors.T
+        return {name: (value - factor * error, value + factor * error) for (name, error), value in found}
 
     def initial_errors(self) -> Float[Tensor, "records n_s"]:
         """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
@@ -176,7 +152,8 @@ class Uncertainty:
         if not names:
             return []
         # The rank must not depend on the units of values and weights.
-        free = self._free[[self.names.index(name) for name in names]]
+        slopes = self._slopes[[self.names.index(name) for name in names]]
+        free = slopes @ self.null[: self.likelihood.weight_count]
         for dim in (1, 0):
             free = normalize(free, dim=dim, eps=1e-300)
         rank = int(torch.linalg.matrix_rank(free, rtol=1e-3))
@@ -201,26 +178,27 @@ def normal_factor(level: float) -> float:
     Raises:
         ValueError: if the probability does not lie between 0 and 1.
     """
-    return float(torch.special.ndtri(torch.tensor(0.5 + 0.5 * _level(level), dtype=torch.float64)))
-
-
-def _level(level: float) -> float:
     if not 0.0 < level < 1.0:
-        raise ValueError(f"level={level} of a confidence region must lie between 0 and 1.")
-    return level
+        raise ValueError(f"level={level} of a confidence interval must lie between 0 and 1.")
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
 class InverseInformation(NamedTuple):
-    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns.
+    """The pseudo-inverse RRᵀ of an information matrix, and the directions of which the matrix says nothing, in columns.
 
     The pseudo-inverse is that of the matrix scaled to unit diagonal, so that it does not depend on the units of the
     unknowns. A direction is one long in these scales. ``silent`` marks unknowns of which the matrix says nothing
     whatever the others are; they have no scale.
     """
 
-    matrix: Float[Tensor, "n n"]
+    root: Float[Tensor, "n n_shown"]
     null: Float[Tensor, "n n_null"]
     silent: Bool[Tensor, " n"]
+
+    @property
+    def matrix(self) -> Float[Tensor, "n n"]:
+        """The pseudo-inverse itself."""
+        return self.root @ self.root.T
 
     def unknown(self, slopes: Float[Tensor, "*quantities n"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the matrix says nothing.
@@ -245,8 +223,8 @@ def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
     shown = values > LEAST_EIGENVALUE
     every = torch.eye(len(H), dtype=H.dtype, device=H.device)
     directions = every[:, seen] @ (vectors / unit[:, None])
-    inverse = (directions[:, shown] / values[shown]) @ directions[:, shown].T
-    return InverseInformation(inverse, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
+    root = directions[:, shown] / values[shown].sqrt()
+    return InverseInformation(root, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
@@ -292,33 +270,6 @@ class Band(NamedTuple):
     low: Float[Tensor, " points"]
     high: Float[Tensor, " points"]
 
-    def covers(self, true: Float[Tensor, " points"]) -> float:
-        """Share of the points at which the interval holds the true curve."""
-        return ((true >= self.low) & (true <= self.high)).double().mean().item()
-
-
-def scatter(
-    closure: nn.Module, features: Float[Tensor, "points n_f"], uncertainty: Uncertainty
-) -> tuple[Float[Tensor, "points n_c"], Float[Tensor, "points n_c"]]:
-    """What a closure says of features, and the standard deviation of it; infinite where the data say nothing.
-
-    Args:
-        closure: the closure.
-        features: features at which it is asked.
-        uncertainty: uncertainty of the closure's trained weights, in the order of ``parameters()``.
-    """
-    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
-
-    def said(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-        found: Tensor = torch.func.functional_call(closure, weights, (x,))
-        return found
-
-    jacobians = torch.func.vmap(torch.func.jacrev(said), in_dims=(None, 0))(trained, features)
-    J = torch.cat([jacobian.flatten(2) for jacobian in jacobians.values()], -1)
-    variance = torch.einsum("pcw,wv,pcv->pc", J, uncertainty.weights_covariance, J)
-    with torch.no_grad():
-        return closure(features), torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
-
 
 def band(
     uncertainty: Uncertainty,
@@ -328,7 +279,7 @@ def band(
     output: int = 0,
     level: float = 0.95,
 ) -> Band:
-    """The interval of one output of the estimated closure along a line of features.
+    """The interval of one output of the estimated closure along a line of features; without end where data say nothing.
 
     Args:
         uncertainty: uncertainty of the estimate.
@@ -341,7 +292,15 @@ def band(
         ValueError: if the level does not lie between 0 and 1.
     """
     closure = uncertainty.likelihood.twin.closure
-    said, deviation = scatter(closure, features, uncertainty)
-    half = normal_factor(level) * deviation[:, output]
-    middle = said[:, output]
+    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
+
+    def value(weights: dict[str, Tensor], point: Tensor) -> Tensor:
+        outputs: Tensor = torch.func.functional_call(closure, weights, (point,))
+        return outputs[..., output]
+
+    slopes = torch.func.vmap(torch.func.jacrev(value), in_dims=(None, 0))(trained, features)
+    J = torch.cat([slope.flatten(1) for slope in slopes.values()], -1)
+    variance = ((J @ uncertainty.weights_covariance) * J).sum(-1)
+    deviation = torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
+    half, middle = normal_factor(level) * deviation, value(trained, features).detach()
     return Band(x, middle, middle - half, middle + half)

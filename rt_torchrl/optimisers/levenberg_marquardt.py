@@ -56,11 +56,6 @@ class LevenbergMarquardt:
     least_step = 1e-9  # change of the weights below which they have arrived, whatever rounding is left of the cost
 
     def __init__(self, module: nn.Module, *, damping: float = 1e-3, tolerance: float = 1e-4, longest_step: float = 1.0):
-        for argument, value in (("damping", damping), ("longest_step", longest_step)):
-            if not value > 0:
-                raise ValueError(f"{argument}={value} of Levenberg-Marquardt must be positive.")
-        if not tolerance >= 0:
-            raise ValueError(f"tolerance={tolerance} of Levenberg-Marquardt must not be negative.")
         self.module, self.damping, self.tolerance, self.longest_step = module, damping, tolerance, longest_step
 
     @torch.no_grad()

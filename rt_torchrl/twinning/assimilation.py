@@ -23,8 +23,15 @@ from rt_torchrl.fit.least_squares import (
     scatter_of,
 )
 from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
-from rt_torchrl.fit.record import SensorRecord, sensor_records
-from rt_torchrl.fit.sensors import Sensor, sensors_of, state_places, state_sensors, with_biases
+from rt_torchrl.fit.sensors import (
+    Sensor,
+    SensorRecord,
+    sensor_records,
+    sensors_of,
+    state_places,
+    state_sensors,
+    with_biases,
+)
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations

@@ -18,14 +18,12 @@ from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.vector_field import ResidualRates
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.vector_field import ResidualRates
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
-from rt_torchrl.plants.vector_field import ResidualRates
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
