@@ -1,5 +1,6 @@
 """The commands that README and documentation print, run as they are printed in a copy of the repository."""
 
+import json
 import os
 import re
 import shlex
@@ -130,7 +131,9 @@ def test_a_quick_training_of_the_pendulum_compiles_and_is_quiet(clone):
     assert "uv run --extra gym recipes/pendulum.py" in commands()
     shown = done("uv run --extra gym recipes/pendulum.py --quick", clone)
     require_quiet(shown)
-    assert "results in" in shown.stdout
+    (folder,) = re.findall(r"results in (\S+)", shown.stdout)
+    found = json.loads((clone / folder / "metrics.json").read_text(encoding="utf-8"))["summary"]["closure"]["found"]
+    assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)  # by Gymnasium's single precision
 
 
 def test_help_is_printed(clone):
