@@ -20,7 +20,7 @@ from benchmarking.timing import Cell, Stopwatch
 from benchmarking.updates import milliseconds_of_update
 from matplotlib.image import imread
 
-from rt_torchrl import Rollout
+from rt_torchrl import Rollout, control_cost
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--casadi", "--plants", "wind_turbine", "--jax"]
@@ -90,6 +90,43 @@ def test_casadi_and_torch_agree(policy, method):
     also, gradient = code.gradient(code.inputs(scenario))
     assert also == pytest.approx(cost.item(), rel=1e-12)
     assert np.linalg.norm(gradient - expected.numpy()) < 1e-10 * expected.norm().item()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("closure", "policy"), [("law", "affine"), ("mlp", "mlp")])
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
+def test_jax_and_torch_agree(plant, closure, policy):
+    """The plants in JAX, with which the engines are compared, are those of the library."""
+    pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
+    from benchmarking.jax_loops import JaxLoops
+
+    system = system_of(Case(plant, closure, policy))
+    scenario = scenario_of(system.case, 60, 3)
+    trajectory = Rollout(system.plant, system.closure, system.policy, engine="autograd")(*scenario)
+    cost = control_cost(system.plant, trajectory).mean()
+    expected = dict(
+        zip(
+            (name for name, _ in system.policy.named_parameters()),
+            torch.autograd.grad(cost, system.weights()),
+            strict=True,
+        )
+    )
+    states = trajectory.states[:, 1:].detach().permute(1, 2, 0).numpy()
+    size = np.abs(states).max((0, 2), keepdims=True)  # of each state
+    whole = torch.cat([part.flatten() for part in expected.values()]).norm().item()
+    assert whole > 0.0
+    for method in ("scan", "sweep"):
+        loops = JaxLoops(system, method)
+        inputs = loops.inputs(scenario)
+        if method == "scan":
+            found_cost, ends = loops.forward(inputs)
+            assert (np.abs(np.asarray(ends) - states) / size).max() < 1e-9
+            assert float(found_cost) == pytest.approx(cost.item(), rel=1e-9)
+        also_cost, gradient = loops.gradient(inputs)
+        assert float(also_cost) == pytest.approx(cost.item(), rel=1e-9)
+        assert set(gradient) == set(expected)
+        gap = [np.asarray(gradient[name]).ravel() - part.flatten().numpy() for name, part in expected.items()]
+        assert np.linalg.norm(np.concatenate(gap)) < 1e-9 * whole
 
 
 def test_casadi_knows_the_drone_with_its_law_alone():
