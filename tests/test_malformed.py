@@ -1,13 +1,165 @@
 """Files and options of others: refused in words, or sound; never a raw error, never accepted in silence."""
 
+import dataclasses
+import math
+import typing
 import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from fault_counts import count
 from hypothesis import HealthCheck, given, settings
+from linear_quadratic import LinearQuadratic
 from malformed_files import GOOD, READERS, damaged, outcome
-from malformed_options import cases
-from malformed_options import outcome as option_outcome
+from torchrl.data import Bounded
+
+import rt_torchrl
+from rt_torchrl import (
+    Actuation,
+    LimitConfig,
+    PlantEnv,
+    Reading,
+    RecedingHorizonConfig,
+    SafetyConfig,
+    SafetyLayer,
+    Signal,
+    TwinningConfig,
+)
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+from rt_torchrl.fit.log import Column, SensorLog
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.action_limits import ActionLimits
+from rt_torchrl.systems.faulty_system import Injection
+from rt_torchrl.systems.watchdog import Watchdog
+
+NUMBERS = (math.nan, math.inf, -math.inf, -1, 0, -1e308, 1e308, 2.5)
+OTHERS = ("x", "", None, [], {}, True, (1.0, 2.0, 3.0), object())
+TIMES = (
+    "interval",
+    "deadline",
+    "hold",
+    "patience",
+    "correlation_time",
+    "gap",
+    "period",
+    "dt",
+    "horizon",
+    "clock_tolerance",
+)
+"""Arguments in seconds, which are never negative."""
+
+
+class Case(typing.NamedTuple):
+    """One constructor with good arguments, and the one that is replaced."""
+
+    make: typing.Callable
+    good: dict
+    argument: str
+    value: object
+
+    def __repr__(self):
+        return f"{getattr(self.make, '__name__', self.make)}({self.argument}={self.value!r})"
+
+    def wrong(self, kind):
+        """Whether no constructor should take this value; what else is accepted may be meant."""
+        if isinstance(self.value, float) and math.isnan(self.value):
+            return True
+        if self.argument in TIMES and isinstance(self.value, int | float) and self.value < 0:
+            return True
+        return kind in (int, float) and (isinstance(self.value, str | bool | list | dict) or type(self.value) is object)
+
+
+def configurations():
+    """Every public configuration, with the default of every option."""
+    for name in dir(rt_torchrl):
+        found = getattr(rt_torchrl, name)
+        if isinstance(found, type) and dataclasses.is_dataclass(found) and name.endswith("Config"):
+            yield found
+    yield TwinningConfig
+
+
+GOOD_OPTIONS = {
+    SafetyConfig: {"interval": 0.1},
+    LimitConfig: {"starts": {}},
+    RecedingHorizonConfig: {"horizon": 2.0},
+    RunConfig: {},
+    Injection: {"kind": "nan"},
+    Column: {"header": "a", "signal": "b"},
+}
+STATES = {"times": np.arange(5.0), "columns": {"x": np.zeros(5)}}
+TABLE = {"tip_speed_ratio": np.arange(1.0, 6.0), "pitch": np.arange(5.0), "values": np.full((5, 5), 0.1)}
+SPEC = Bounded(low=-2.0, high=2.0, shape=(1,), dtype=torch.float64)
+CONSTRUCTORS = [
+    (LinearQuadratic, {"dt": 0.1, "horizon": 2.0}),
+    (WindTurbine, {"dt": 0.05, "horizon": 10.0}),
+    (FlappingWing, {"dt": 0.001, "horizon": 0.1}),
+    (CryogenicTank, {"dt": 30.0, "horizon": 3000.0}),
+    (Pendulum, {"dt": 0.05, "horizon": 2.0}),
+    (lambda **o: PlantEnv(LinearQuadratic(horizon=2.0), **o), {"batch_size": 1, "noise": 0.1, "seed": 0}),
+    (lambda **o: SafetyLayer(PlantEnv(LinearQuadratic()), SafetyConfig(interval=0.1), **o), {"fallback": (0.0,)}),
+    (Reading, {"scale": 1.0, "offset": 0.0}),
+    (Actuation, {"scale": 1.0, "offset": 0.0}),
+    (lambda **o: Signal(symbol="x", name="x", unit="m", **o), {"low": -1.0, "high": 1.0}),
+    (lambda **o: Watchdog({}, **o), {"deadline": 1.0, "hold": 1.0, "patience": 1.0}),
+    (lambda **o: ActionLimits(SPEC, **o), {"interval": 0.1, "low": (-1.0,), "high": (1.0,), "rates": (1.0,)}),
+    (SensorLog, STATES),
+    (PowerCoefficientTable, TABLE),
+    (lambda **o: WindRecord(source="test", **o), {"time": np.arange(5.0), "speed": np.full(5, 8.0)}),
+]
+
+
+def spoilt(good):
+    """Wrong values in the place of a good one."""
+    if isinstance(good, np.ndarray):
+        flat = [good.copy().astype(float) for _ in range(5)]
+        for array, value in zip(flat, (math.nan, math.inf, -math.inf, -1e308, 1e308), strict=True):
+            array.flat[good.size // 2] = value
+        return [*flat, good[..., None], good[:1], good[:0], good.astype(str), good.astype(object), "x", None, [], 3.0]
+    if isinstance(good, tuple) and good and isinstance(good[0], float):
+        tuples = [(value, *good[1:]) for value in NUMBERS]
+        return [*tuples, (), (*good, *good), ("x",), (None,), "x", 3.0, object()]
+    return [*NUMBERS, *OTHERS]
+
+
+def cases():
+    """All cases with the declared type of the argument, in a fixed order."""
+    for config in dict.fromkeys((*configurations(), *GOOD_OPTIONS)):
+        kinds = typing.get_type_hints(config)
+        for field in dataclasses.fields(config):
+            kind = kinds[field.name]
+            if dataclasses.is_dataclass(kind) or kind is Path or typing.get_origin(kind) in (Mapping, Sequence):
+                continue
+            good = GOOD_OPTIONS.get(config, {}).get(field.name, getattr(config, field.name, None))
+            for value in spoilt(good):
+                yield Case(config, GOOD_OPTIONS.get(config, {}), field.name, value), kind
+    for make, good in CONSTRUCTORS:
+        for argument, value in good.items():
+            for bad in spoilt(value):
+                yield Case(make, good, argument, bad), type(value)
+
+
+def option_outcome(case, kind):
+    """What becomes of a case: refused, accepted, wrong (accepted), unnamed (refused without its name), or raw."""
+    try:
+        case.make(**case.good | {case.argument: case.value})
+    except ValueError as error:
+        words = {"times": ("time", "log"), "columns": ("column",)}.get(case.argument, case.argument.split("_"))
+        return "refused" if any(word in str(error) for word in (case.argument, *words)) else f"unnamed: {error}"
+    except Exception as error:
+        return f"raw: {type(error).__name__}: {error}"
+    return "wrong" if case.wrong(kind) else "accepted"
+
+
+# Files and options of others: refused in words, or sound; never a raw error, never accepted in silence.
+
 
 FEW, MANY = 5, 150
 SHARED = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}

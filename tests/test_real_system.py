@@ -1,8 +1,7 @@
 """Environments of others as the real system: their entries, units and limits, whole trainings on them, what is refused.
 
 The oracle is the oracle plant's own environment, handed over as if somebody else had written it: in other units, under
-other keys. A training on it must be the training on the plant itself.
-"""
+other keys. A training on it must be the training on the plant itself."""
 
 import dataclasses
 import json
@@ -17,7 +16,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem
+from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.runs.run import Run
@@ -285,3 +284,26 @@ def test_units_that_are_no_numbers_are_refused(kind, argument, value):
 def test_a_constant_input_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match=r"exogenous=\(nan,\)"):
         connected(LinearQuadratic(), exogenous=(float("nan"),))
+
+
+# What a run on a real system refuses, because only a plant in simulation can do it, and the other way round.
+
+
+@pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])
+def test_options_of_a_simulation_are_refused(options, tmp_path):
+    with pytest.raises(ValueError, match="real system"):
+        run_on(connected(LinearQuadratic(horizon=2.0)), tmp_path, **options)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_real_controller_is_refused_where_policies_are_judged_in_simulation(simulated, tmp_path):
+    class Machine(RealController):
+        def fly_real(self, count, *, seed):
+            raise AssertionError("nothing is flown")
+
+    plant = LinearQuadratic(horizon=2.0)
+    env = None if simulated else connected(plant, closure=plant.closure)
+    config = RunConfig(log_dir=tmp_path / "run", compiled=False)
+    with pytest.raises(ValueError, match=r"baselines \['machine'\] can only be flown on a real system"):
+        Run(config, plant, env=env, baselines={"machine": Machine})
+    assert not (tmp_path / "run").exists()
