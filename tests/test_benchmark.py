@@ -93,9 +93,9 @@ def test_casadi_and_torch_agree(policy, method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("closure", "policy"), [("law", "affine"), ("mlp", "mlp")])
+@pytest.mark.parametrize(("closure", "policy", "method"), [("law", "affine", "scan"), ("mlp", "mlp", "sweep")])
 @pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
-def test_jax_and_torch_agree(plant, closure, policy):
+def test_jax_and_torch_agree(plant, closure, policy, method):
     """The plants in JAX, with which the engines are compared, are those of the library."""
     pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
     from benchmarking.jax_loops import JaxLoops
@@ -104,29 +104,23 @@ def test_jax_and_torch_agree(plant, closure, policy):
     scenario = scenario_of(system.case, 60, 3)
     trajectory = Rollout(system.plant, system.closure, system.policy, engine="autograd")(*scenario)
     cost = control_cost(system.plant, trajectory).mean()
-    expected = dict(
-        zip(
-            (name for name, _ in system.policy.named_parameters()),
-            torch.autograd.grad(cost, system.weights()),
-            strict=True,
-        )
-    )
-    states = trajectory.states[:, 1:].detach().permute(1, 2, 0).numpy()
-    size = np.abs(states).max((0, 2), keepdims=True)  # of each state
+    names = [name for name, _ in system.policy.named_parameters()]
+    expected = dict(zip(names, torch.autograd.grad(cost, system.weights()), strict=True))
     whole = torch.cat([part.flatten() for part in expected.values()]).norm().item()
     assert whole > 0.0
-    for method in ("scan", "sweep"):
-        loops = JaxLoops(system, method)
-        inputs = loops.inputs(scenario)
-        if method == "scan":
-            found_cost, ends = loops.forward(inputs)
-            assert (np.abs(np.asarray(ends) - states) / size).max() < 1e-9
-            assert float(found_cost) == pytest.approx(cost.item(), rel=1e-9)
-        also_cost, gradient = loops.gradient(inputs)
-        assert float(also_cost) == pytest.approx(cost.item(), rel=1e-9)
-        assert set(gradient) == set(expected)
-        gap = [np.asarray(gradient[name]).ravel() - part.flatten().numpy() for name, part in expected.items()]
-        assert np.linalg.norm(np.concatenate(gap)) < 1e-9 * whole
+    loops = JaxLoops(system, method)
+    inputs = loops.inputs(scenario)
+    if method == "scan":
+        states = trajectory.states[:, 1:].detach().permute(1, 2, 0).numpy()
+        size = np.abs(states).max((0, 2), keepdims=True)  # of each state
+        found_cost, ends = loops.forward(inputs)
+        assert (np.abs(np.asarray(ends) - states) / size).max() < 1e-9
+        assert float(found_cost) == pytest.approx(cost.item(), rel=1e-9)
+    also_cost, gradient = loops.gradient(inputs)
+    assert float(also_cost) == pytest.approx(cost.item(), rel=1e-9)
+    assert set(gradient) == set(expected)
+    gap = [np.asarray(gradient[name]).ravel() - part.flatten().numpy() for name, part in expected.items()]
+    assert np.linalg.norm(np.concatenate(gap)) < 1e-9 * whole
 
 
 def test_casadi_knows_the_drone_with_its_law_alone():
