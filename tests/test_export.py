@@ -27,8 +27,9 @@ ROUNDING = 1e-12
 
 
 def policies_of_the_plants():
-    for name, kind in shipped_plants().items():
-        plant = kind()
+    """One of each class: of the other plants, the policies are those of the turbine."""
+    for name in ("wind_turbine", "cryogenic_tank", "pendulum"):
+        plant = shipped_plants()[name]()
         yield pytest.param(plant, plant.make_policy(seeded()), id=name)
 
 

@@ -32,14 +32,15 @@ WITHOUT_NEURAL_CLOSURE = ("pendulum",)
 
 
 def combinations():
-    """Plant, closure, policy and model-free policy; without what the recipes refuse."""
+    """Plant, closure, policy and model-free policy: every pair of policies, and every closure."""
     for plant in PLANTS:
         kind = config_class_of(RECIPES / f"{plant}.py")
-        closures, policies = choices(kind, "closure"), choices(kind, "policy")
-        for closure, policy, other in itertools.product(closures, policies, ("same", *policies)):
-            apart = "scheduled" in (policy, other) and other not in ("same", policy, "mlp")
-            if not apart and not (closure == "mlp" and plant in WITHOUT_NEURAL_CLOSURE):
+        (closure, *closures), policies = choices(kind, "closure"), choices(kind, "policy")
+        for policy, other in itertools.product(policies, ("same", *policies)):
+            if "scheduled" not in (policy, other) or other in ("same", policy, "mlp"):
                 yield plant, closure, policy, other
+        for further in closures if plant not in WITHOUT_NEURAL_CLOSURE else ():
+            yield plant, further, policies[0], "same"
 
 
 @pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
