@@ -341,7 +341,7 @@ def test_weights_of_another_task_are_refused():
 # Seeds side by side, and a search over options.
 
 
-SHORT_TRAINING = Path(__file__).with_name("small_recipe.py")
+TINY = Path(__file__).with_name("small_recipe.py")
 
 
 class Trial:
@@ -386,7 +386,7 @@ def test_what_is_neither_a_range_nor_choices_is_refused(text):
 
 def test_a_sweep_keeps_its_own_options(tmp_path):
     with pytest.raises(ValueError, match="given holds --log-dir, --seed"):
-        seeded_runs(SHORT_TRAINING, [0], tmp_path, ["--seed", "3", "--log_dir=x"])
+        seeded_runs(TINY, [0], tmp_path, ["--seed", "3", "--log_dir=x"])
     config = recipe("sweep").Config
     with pytest.raises(ValueError, match="go together"):
         config(plant="wind_turbine", trials=3)
@@ -398,25 +398,23 @@ def test_seeds_are_trained_and_compared(tmp_path, monkeypatch, capsys):
     """In this process, because another one would load PyTorch for each seed."""
     monkeypatch.setattr(sweep, "side_by_side", lambda batches, **_: [run.run() for batch in batches for run in batch])
     made = recipe("sweep")
-    config = made.Config(plant=str(SHORT_TRAINING), seeds=(3, 4), given="--horizon 1.0", log_dir=tmp_path)
+    config = made.Config(plant=str(TINY), seeds=(3, 4), given="--horizon 1.0", log_dir=tmp_path)
     made.main(config)
     folders = [tmp_path / "small_recipe" / f"seed-{seed}" for seed in (3, 4)]
     settings = [json.loads((folder / "config.json").read_text()) for folder in folders]
     assert [(one["seed"], one["horizon"], one["threads"]) for one in settings] == [(3, 1.0, 1), (4, 1.0, 1)]
     row = capsys.readouterr().out.splitlines()[1].split()
-    costs = [SeededRun(recipe=SHORT_TRAINING, seed=0, folder=folder).cost() for folder in folders]
+    costs = [SeededRun(recipe=TINY, seed=0, folder=folder).cost() for folder in folders]
     assert row[2] == "2" and float(row[3]) == pytest.approx(sum(costs) / 2, rel=1e-4)
     assert (tmp_path / "small_recipe" / "seeds.png").exists()
 
 
 def test_a_sweep_goes_on_where_it_was_cut_short_and_refuses_runs_of_other_options(tmp_path):
-    (run,) = seeded_runs(SHORT_TRAINING, [3], tmp_path, ["--horizon", "1.0"])
+    (run,) = seeded_runs(TINY, [3], tmp_path, ["--horizon", "1.0"])
     run.run()
     assert run.done() and run.arguments()[6] == "--resume"
     longer, patient, other = (
-        SeededRun(
-            recipe=SHORT_TRAINING, seed=3, folder=run.folder, options=("--horizon", horizon, "--episodes", "3", *more)
-        )
+        SeededRun(recipe=TINY, seed=3, folder=run.folder, options=("--horizon", horizon, "--episodes", "3", *more))
         for horizon, more in (("1.0", ()), ("1.0", ("--patience", "1")), ("2.0", ()))
     )
     with pytest.raises(
@@ -431,8 +429,8 @@ def test_a_sweep_goes_on_where_it_was_cut_short_and_refuses_runs_of_other_option
 
 def test_a_run_that_its_patience_or_a_callback_has_ended_is_done(tmp_path):
     options = ("--horizon", "1.0", "--episodes", "9")
-    stopped = SeededRun(recipe=SHORT_TRAINING, seed=3, folder=tmp_path, options=(*options, "--patience", "1"))
-    longer = SeededRun(recipe=SHORT_TRAINING, seed=3, folder=tmp_path, options=options)
+    stopped = SeededRun(recipe=TINY, seed=3, folder=tmp_path, options=(*options, "--patience", "1"))
+    longer = SeededRun(recipe=TINY, seed=3, folder=tmp_path, options=options)
     stopped.run()
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert len(metrics["episodes"]) < 9 and metrics["summary"]["ended"] == "no gain of 1 % in the last 1 episodes"
@@ -458,7 +456,7 @@ def test_a_search_finds_the_least_cost_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "train_all", train)
     over = [Searched.read("x=0..5")]
     for done in (12, 24):
-        study = sweep.search(SHORT_TRAINING, over, [0, 1], tmp_path, trials=12, jobs=1)
+        study = sweep.search(TINY, over, [0, 1], tmp_path, trials=12, jobs=1)
         assert len(study.trials) == done
     assert study.best_params == {"x": 3} and study.best_value == 0.5
     table = sweep.trials_table(study).splitlines()
@@ -474,10 +472,8 @@ def test_a_search_with_real_trainings(tmp_path, capsys):
     over = ("twinning.planner.iterations=0|4",)
     given = "--twinning.arm model_based"
     options = {"given": given, "trials": 6, "over": over, "log_dir": tmp_path, "jobs": 1, "seeds": (0,)}
-    recipe("sweep").main(recipe("sweep").Config(plant=str(SHORT_TRAINING), **options))
+    recipe("sweep").main(recipe("sweep").Config(plant=str(TINY), **options))
     rows = capsys.readouterr().out.splitlines()
     assert rows[-6].split()[2:] == ["--twinning.planner.iterations", "4"]
-    best = json.loads(
-        (tmp_path / SHORT_TRAINING.stem / f"trial-{rows[-6].split()[0]}" / "seed-0" / "metrics.json").read_text()
-    )
+    best = json.loads((tmp_path / TINY.stem / f"trial-{rows[-6].split()[0]}" / "seed-0" / "metrics.json").read_text())
     assert float(rows[-6].split()[1]) == pytest.approx(best["summary"]["unseen"]["J_a_model_based"]["mean"], rel=1e-4)
