@@ -63,7 +63,9 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize("plant", CHOICES)
+@pytest.mark.parametrize(
+    "plant", [pytest.param("wind_turbine", marks=pytest.mark.slow), "flapping_wing", "cryogenic_tank"]
+)
 def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path, monkeypatch):
     made, drawn = load_recipe(RECIPES / f"{plant}.py"), plant == "wind_turbine"
     small = {"episodes": 1, "unseen": 2, "untrained": 0, "figures": drawn, "figures_every": 0, "twinning": SMALL}
