@@ -264,6 +264,7 @@ def train(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_real_system_short_horizon_and_td3(train):
     assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
 
@@ -305,6 +306,7 @@ def test_the_device_refuses_what_a_gpu_refuses():
         assert here[torch.tensor([0])].device == here.copy_(torch.ones(3)).device == device
 
 
+@pytest.mark.slow
 def test_a_plant_elsewhere_is_checked_and_asked_there():
     with pretend_device() as device:
         plant = WindTurbine(horizon=5.0)

@@ -45,6 +45,7 @@ print(extra["interface.json"])
 """
 
 
+@pytest.mark.slow
 def test_a_program_needs_torch_alone(tmp_path):
     plant = shipped_plants()["wind_turbine"]()
     policy = SaturatedMLP(2, plant.actions, generator=seeded())
