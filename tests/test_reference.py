@@ -131,6 +131,7 @@ def mean(contender):
     return sum(contender["costs"]) / len(contender["costs"])
 
 
+@pytest.mark.slow
 def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
     config, _ = leave_run(tmp_path / "run", "wind_turbine", policy="paper", horizon=15.0)
     found = run(tmp_path, mpc=("held", "scattered", "preview"), run=tmp_path / "run")
