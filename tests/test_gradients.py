@@ -22,9 +22,9 @@ PLANTS = {
     "linear_quadratic": lambda: LinearQuadratic(dt=0.1, horizon=4.0),
     # Below rated wind, between the limits of the reference speed: the field has no kink on the way.
     "wind_turbine": lambda: WindTurbine(horizon=30.0, wind=KaimalWind(mean=8.0, intensity=0.1)),
-    # A beat, 100 steps.
-    "flapping_wing": lambda: FlappingWing(horizon=0.05),
-    "cryogenic_tank": lambda: CryogenicTank(horizon=1800.0),
+    # Half a beat, 50 steps.
+    "flapping_wing": lambda: FlappingWing(horizon=0.025),
+    "cryogenic_tank": lambda: CryogenicTank(horizon=900.0),
 }
 # Offset and number of outputs of a perceptron that stands in for a plant's closure. The tank's coefficients, of sizes
 # 50 to 5e11, are beyond one.
