@@ -1,5 +1,6 @@
 """The benchmark times every contender, compares their results, and says what it leaves out."""
 
+import importlib.util
 import json
 import math
 import runpy
@@ -19,7 +20,7 @@ from benchmarking.timing import Cell, Stopwatch
 from benchmarking.updates import milliseconds_of_update
 from matplotlib.image import imread
 
-from rt_torchrl import Rollout
+from rt_torchrl import Rollout, control_cost
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--casadi", "--plants", "wind_turbine", "--jax"]
@@ -41,10 +42,12 @@ def cell(size, contender, quantity="gradient", wall=float("nan"), **more):
 
 @pytest.mark.slow
 def test_every_engine_is_timed_and_compared(tmp_path):
-    found = compared(tmp_path, *SMALL, "--engines", "parallel", "autograd", "odeint_adjoint")
-    assert set(found) == {
-        (name, quantity) for name in ("parallel", "autograd", "odeint_adjoint") for quantity in ("forward", "gradient")
-    }
+    jax = ("jax_scan", "jax_sweep") if importlib.util.find_spec("jax") else ()
+    found = compared(tmp_path, *SMALL, *jax, "--engines", "parallel", "autograd", "odeint_adjoint")
+    names = ("parallel", "autograd", "odeint_adjoint", *jax)
+    expected = {(name, quantity) for name in names for quantity in ("forward", "gradient")}
+    assert set(found) == expected - {("jax_sweep", "forward")}  # it goes forward by the same scan
+    assert all(found[name, "gradient"]["gap"] < 1e-9 for name in jax)
     assert all(cell["wall"] > 0 and cell["cpu"] > 0 for cell in found.values())
     # Both exact gradients agree to rounding; the continuous adjoint differs from them by the order of its step.
     assert found["autograd", "gradient"]["gap"] < 1e-11
@@ -61,15 +64,6 @@ def test_a_size_that_does_not_vary_has_no_panels(tmp_path):
         (path,) = save_figures(cells, tmp_path)
         heights.append(len(imread(path)))
     assert heights[0] == 2 * heights[1] > 0
-
-
-@pytest.mark.slow
-def test_jax_takes_part(tmp_path):
-    pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
-    found = compared(tmp_path, *SMALL, "jax_scan", "jax_sweep", "--engines", "parallel")
-    assert found["jax_scan", "gradient"]["gap"] < 1e-9 and found["jax_sweep", "gradient"]["gap"] < 1e-9
-    # The sweep goes forward by the same scan.
-    assert ("jax_scan", "forward") in found and ("jax_sweep", "forward") not in found
 
 
 @pytest.mark.slow
@@ -96,6 +90,37 @@ def test_casadi_and_torch_agree(policy, method):
     also, gradient = code.gradient(code.inputs(scenario))
     assert also == pytest.approx(cost.item(), rel=1e-12)
     assert np.linalg.norm(gradient - expected.numpy()) < 1e-10 * expected.norm().item()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("closure", "policy", "method"), [("law", "affine", "scan"), ("mlp", "mlp", "sweep")])
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
+def test_jax_and_torch_agree(plant, closure, policy, method):
+    """The plants in JAX, with which the engines are compared, are those of the library."""
+    pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
+    from benchmarking.jax_loops import JaxLoops
+
+    system = system_of(Case(plant, closure, policy))
+    scenario = scenario_of(system.case, 60, 3)
+    trajectory = Rollout(system.plant, system.closure, system.policy, engine="autograd")(*scenario)
+    cost = control_cost(system.plant, trajectory).mean()
+    names = [name for name, _ in system.policy.named_parameters()]
+    expected = dict(zip(names, torch.autograd.grad(cost, system.weights()), strict=True))
+    whole = torch.cat([part.flatten() for part in expected.values()]).norm().item()
+    assert whole > 0.0
+    loops = JaxLoops(system, method)
+    inputs = loops.inputs(scenario)
+    if method == "scan":
+        states = trajectory.states[:, 1:].detach().permute(1, 2, 0).numpy()
+        size = np.abs(states).max((0, 2), keepdims=True)  # of each state
+        found_cost, ends = loops.forward(inputs)
+        assert (np.abs(np.asarray(ends) - states) / size).max() < 1e-9
+        assert float(found_cost) == pytest.approx(cost.item(), rel=1e-9)
+    also_cost, gradient = loops.gradient(inputs)
+    assert float(also_cost) == pytest.approx(cost.item(), rel=1e-9)
+    assert set(gradient) == set(expected)
+    gap = [np.asarray(gradient[name]).ravel() - part.flatten().numpy() for name, part in expected.items()]
+    assert np.linalg.norm(np.concatenate(gap)) < 1e-9 * whole
 
 
 def test_casadi_knows_the_drone_with_its_law_alone():

@@ -1,7 +1,9 @@
 """The commands that README and documentation print, run as they are printed in a copy of the repository."""
 
+import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -13,10 +15,10 @@ import pytest
 from printed_commands import ROOT, commands
 from test_pendulum import require_quiet
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("uv") is None, reason="the printed commands are run by uv"),
-]
+from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.user_code import module_of
+
+pytestmark = pytest.mark.slow
 TRAININGS = [
     command
     for command in commands()
@@ -42,6 +44,8 @@ def clone(tmp_path_factory):
 
 def started(command, clone, **options):
     """The command as printed, in a shell; uv takes the environment of this process instead of making one."""
+    if shutil.which("uv") is None:
+        pytest.skip("the printed commands are run by uv")
     environment = {
         **os.environ,
         "UV_NO_SYNC": "1",
@@ -85,20 +89,41 @@ def require_begun(command, clone, tmp_path, sign):
             end(process)
 
 
+def test_the_first_command_begins(clone, tmp_path):
+    """Up to its first real episode; the commands below do so in this process."""
+    assert TRAININGS[0] == "uv run recipes/wind_turbine.py --quick"
+    require_begun(TRAININGS[0], clone, tmp_path, r"real episode \d")
+
+
+class BegunError(Exception):
+    """What a command was asked for has begun."""
+
+
+def begun(*_, **__):
+    raise BegunError
+
+
+def require_begun_here(command, clone, monkeypatch, begin):
+    """The main of the printed recipe on the printed options, up to what ``begin`` names."""
+    name, arguments = re.fullmatch(r"uv run .*?recipes/(\w+)\.py ?(.*)", command).groups()
+    module = module_of(clone / "recipes" / f"{name}.py")
+    monkeypatch.chdir(clone)
+    monkeypatch.setattr(begin if "." in begin else f"{module.__name__}.{begin}", begun)
+    with pytest.raises(BegunError):
+        module.main(from_command_line(module.Config, shlex.split(arguments)))
+
+
 @pytest.mark.parametrize("command", TRAININGS)
-def test_a_printed_training_begins(command, clone, tmp_path):
+def test_a_printed_training_begins(command, clone, monkeypatch):
     """Up to its first real episode; the tests of the algorithm train on."""
     if "rosco" in command:
         pytest.importorskip("rosco")
+    first = "rt_torchrl.twinning.algorithm.ReinforcementTwinning.episode"
     folder = re.search(r"(runs/wind_turbine/TIME-seed-0)/config\.json", command)
     if folder:  # the options of a run that is there
-        require_begun(
-            f"uv run recipes/wind_turbine.py --quick --overwrite --log-dir {folder[1]}",
-            clone,
-            tmp_path,
-            r"real episode \d",
-        )
-    require_begun(command, clone, tmp_path, r"real episode \d")
+        earlier = f"uv run recipes/wind_turbine.py --quick --overwrite --log-dir {folder[1]}"
+        require_begun_here(earlier, clone, monkeypatch, first)
+    require_begun_here(command, clone, monkeypatch, first)
 
 
 def test_a_quick_training_of_the_pendulum_compiles_and_is_quiet(clone):
@@ -106,7 +131,9 @@ def test_a_quick_training_of_the_pendulum_compiles_and_is_quiet(clone):
     assert "uv run --extra gym recipes/pendulum.py" in commands()
     shown = done("uv run --extra gym recipes/pendulum.py --quick", clone)
     require_quiet(shown)
-    assert "results in" in shown.stdout
+    (folder,) = re.findall(r"results in (\S+)", shown.stdout)
+    found = json.loads((clone / folder / "metrics.json").read_text(encoding="utf-8"))["summary"]["closure"]["found"]
+    assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)  # by Gymnasium's single precision
 
 
 def test_help_is_printed(clone):
@@ -152,5 +179,6 @@ def test_the_hooks_are_installed(clone):
 @pytest.mark.parametrize(
     "command", [command for command in commands() if re.search(r"recipes/(study|unknown|worth).py", command)]
 )
-def test_a_printed_study_begins(command, clone, tmp_path):
-    require_begun(command, clone, tmp_path, r"study: .*\d+/\d+")
+def test_a_printed_study_begins(command, clone, monkeypatch):
+    """Up to its plan of tasks; the tests of the study run some."""
+    require_begun_here(command, clone, monkeypatch, "side_by_side" if "study.py" in command else "on_this_machine")

@@ -2,14 +2,18 @@
 
 import dataclasses
 import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
-from device_mode import RequireDevice
-from pretend_device import NAME, pretend_device
 from small_runs import SMALL
-from torch.utils._pytree import tree_leaves
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -18,6 +22,208 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 from rt_torchrl.steps.config import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
+
+
+class _Backend(_DummyBackendModule):
+    """What ``torch.cuda`` is to CUDA."""
+
+    def synchronize(self, device=None):
+        """Nothing: all is done at once."""
+
+    def get_rng_state(self, device=None):
+        return torch.get_rng_state()
+
+    def set_rng_state(self, state, device=None):
+        """Nothing: its global generator is that of the CPU."""
+
+    def get_amp_supported_dtype(self):
+        """No type of lower precision; torch asks whenever it knows a device of this name."""
+        return []
+
+
+NAME = "pretend"
+_setup_privateuseone_for_python_backend(NAME, backend_module=_Backend())
+DEVICE = torch.device(NAME, 0)
+REAL = torch.Generator
+aten = torch.ops.aten
+MOVES = (aten._to_copy.default, aten.copy_.default)
+INDEXING = (aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default)
+FROM_DATA = (torch.tensor, torch.as_tensor, torch.asarray)
+READ = (torch.Tensor.tolist, torch.Tensor.__format__)
+PLACES = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
+
+
+class PretendTensor(torch.Tensor):
+    """Says that it is on the device, around a tensor on the CPU."""
+
+    @staticmethod
+    def __new__(cls, inner):
+        like = {"strides": inner.stride(), "storage_offset": inner.storage_offset(), "dtype": inner.dtype}
+        return torch.Tensor._make_wrapper_subclass(cls, inner.size(), device=DEVICE, **like)
+
+    def __init__(self, inner):
+        self.inner = inner
+
+    def __repr__(self):
+        return f"PretendTensor({self.inner})"
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return carried_out(func, args, kwargs or {})
+
+
+class PretendGenerator(REAL):
+    """A generator of the device."""
+
+    def __new__(cls):
+        return super().__new__(cls, "cpu")
+
+    @property
+    def device(self):
+        return DEVICE
+
+
+class _AnyGenerator(type):
+    def __instancecheck__(cls, instance):
+        return type.__instancecheck__(REAL, instance)
+
+
+class _Generator(metaclass=_AnyGenerator):
+    """Stands for ``torch.Generator``, which makes none of a device that torch was not built for."""
+
+    def __new__(cls, device="cpu"):
+        return PretendGenerator() if torch.device(device).type == NAME else REAL(device=device)
+
+
+class PretendKernels(TorchDispatchMode):
+    """Makes a tensor on the device where one is asked for there; what has one among its arguments needs no mode."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        return carried_out(func, args, kwargs or {})
+
+
+class PretendFunctions(TorchFunctionMode):
+    """What torch does with a device above its kernels."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func in FROM_DATA and kwargs.get("device") is not None:
+            return func(*args, **kwargs | {"device": None}).to(kwargs["device"])
+        if func is torch.Tensor.new_tensor:
+            return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(args[0].device)
+        if func in READ:
+            args = (args[0].cpu(), *args[1:])
+        if func is torch.Tensor.numpy and isinstance(args[0], PretendTensor):
+            raise TypeError(f"numpy cannot read a tensor on {DEVICE}; copy it to the CPU first.")
+        if func in PLACES and isinstance(args[0], PretendTensor):
+            # Torch lifts a list of places to the device below any mode.
+            args = (args[0], lifted(args[1]), *args[2:])
+        found = func(*args, **kwargs)
+        # The kernels get another object for the generator, which does not know its device.
+        for given in (x for x in (*args, *kwargs.values()) if isinstance(x, REAL)):
+            if isinstance(found, torch.Tensor) and found.device.type != given.device.type:
+                raise RuntimeError(f"{func.__name__}: generator on {given.device}, tensor on {found.device}.")
+        return found
+
+
+def lifted(index):
+    """A place in a tensor, with tensors for sequences."""
+    parts = index if isinstance(index, tuple) else (index,)
+    found = (torch.tensor(x, dtype=None if x else torch.long) if isinstance(x, list | tuple) else x for x in parts)
+    return tuple(found)
+
+
+def carried_out(func, args, kwargs):
+    """The operation on the CPU; its result is on the device if it was asked for there, or is made of such tensors."""
+    tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
+    others = [x for x in tensors if not isinstance(x, PretendTensor)]
+    if len(others) < len(tensors) and not may_mix(func, args, others):
+        raise RuntimeError(f"{func}: expected all tensors on {DEVICE}, {[tuple(x.shape) for x in others]} are on cpu.")
+    asked = kwargs.get("device")
+    there = len(others) < len(tensors) if asked is None else torch.device(asked).type == NAME
+    if func is aten.copy_.default:
+        there = isinstance(args[0], PretendTensor)
+    inner, named = tree_map_only(PretendTensor, lambda x: x.inner, (args, kwargs))
+    if asked is not None:
+        named["device"] = torch.device("cpu")
+    # A tensor of zeros without memory cannot be wrapped.
+    kernel = aten.zeros.default if func is aten._efficientzerotensor.default else func
+    found = kernel(*inner, **named)
+    if not there:
+        return args[0] if func is aten.copy_.default else found
+    return return_and_correct_aliasing(func, args, kwargs, tree_map_only(torch.Tensor, PretendTensor, found))
+
+
+def may_mix(func, args, others):
+    """Whether CUDA too takes these tensors of the CPU beside its own."""
+    if func in MOVES or not others:
+        return True
+    here = isinstance(args[0], PretendTensor)
+    if func in INDEXING:  # the places may lie on the CPU
+        return here and (len(args) < 3 or isinstance(args[2], PretendTensor) or not args[2].dim())
+    numbers = torch.Tag.pointwise in func.tags and not any(x.dim() for x in others)
+    return numbers and (here or not func._schema.is_mutable)
+
+
+@contextmanager
+def pretend_device() -> Iterator[torch.device]:
+    """The device, as long as the block lasts; ``device="pretend"`` names it."""
+    # The backward pass of a device has a thread of its own, which the modes do not reach.
+    with torch.autograd.set_multithreading_enabled(False), PretendFunctions(), PretendKernels():
+        torch.Generator = _Generator
+        try:
+            yield DEVICE
+        finally:
+            torch.Generator = REAL
+
+
+# A mode that fails where a tensor is made without a device.
+
+
+ROOT = Path(__file__).resolve().parent.parent
+WATCHED = tuple(str(ROOT / folder) + "/" for folder in ("rt_torchrl", "envs"))
+FACTORIES = {
+    torch.arange,
+    torch.empty,
+    torch.eye,
+    torch.full,
+    torch.from_numpy,
+    torch.linspace,
+    torch.logspace,
+    torch.ones,
+    torch.rand,
+    torch.randint,
+    torch.randn,
+    torch.randperm,
+    torch.scalar_tensor,
+    torch.tensor,
+    torch.zeros,
+}
+"""All that make a tensor from nothing; ``as_tensor`` leaves a tensor where it is, and is asked about numbers alone."""
+
+
+class RequireDevice(TorchFunctionMode):
+    """A mode that collects the places where code of this library makes a tensor without naming its device."""
+
+    def __init__(self):
+        super().__init__()
+        self.found: dict[str, str] = {}
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        numbers = func is torch.as_tensor and not isinstance(args[0], torch.Tensor)
+        if (func in FACTORIES or numbers) and kwargs.get("device") is None:
+            frame = sys._getframe(1)
+            if frame.f_code.co_filename.startswith(WATCHED):
+                place = f"{Path(frame.f_code.co_filename).relative_to(ROOT)}:{frame.f_lineno}"
+                self.found[place] = func.__name__
+        return func(*args, **kwargs)
+
+
+# Whole trainings on a device that is not the CPU: every tensor lies where the run's generator does.
+
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 # One gradient of each kind makes every kind of tensor.
@@ -57,6 +263,7 @@ def train(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_real_system_short_horizon_and_td3(train):
     assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
 
@@ -98,6 +305,7 @@ def test_the_device_refuses_what_a_gpu_refuses():
         assert here[torch.tensor([0])].device == here.copy_(torch.ones(3)).device == device
 
 
+@pytest.mark.slow
 def test_a_plant_elsewhere_is_checked_and_asked_there():
     with pretend_device() as device:
         plant = WindTurbine(horizon=5.0)

@@ -1,20 +1,24 @@
-"""The documentation: every Python block runs, every public name has an entry, and the site builds without warnings."""
+"""README and documentation: their code and plants run, names have entries, the site builds without warnings."""
 
 import ast
 import importlib.util
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import fresh_process
 import pytest
 import torch
 from printed_commands import ROOT, TEXTS, blocks
-from test_export_recipe import leave_run
+from tensordict import TensorDict
+from test_export_recipe import RECIPES, leave_run, recipe
 
 import rt_torchrl
-from rt_torchrl import check_plant
+from rt_torchrl import check_plant, load_run
 from rt_torchrl.atomic_file import write_json
+from rt_torchrl.contract.check import require_controller
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -22,14 +26,14 @@ from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE
 
-RUN_HERE = ["finished_run.md", "gallery.md", "habits.md", "hypotheses.md", "unknown_systems.md"]
+RUN_HERE = "README finished_run gallery habits heated_room hypotheses own_plant quadrotor unknown_systems".split()
 
 
 def test_every_page_with_code_is_run():
     """A page with a block needs a test that runs it, here or in another file that names the page."""
     others = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py") if path != Path(__file__)]
     for page in TEXTS:
-        if blocks(page, "python") and page not in RUN_HERE:
+        if blocks(page, "python") and page.removesuffix(".md") not in RUN_HERE:
             assert any(re.search(rf"\b{page}\b", text) for text in others), page
 
 
@@ -150,3 +154,153 @@ def test_the_site_builds_without_warnings(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     assert (tmp_path / "api" / "runs.html").exists() and not Path(tmp_path / "_build").exists()
+
+
+# The code and the commands of the README are right.
+
+
+TUTORIAL = (ROOT / "docs" / "own_plant.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_its_code_runs(monkeypatch):
+    from rt_torchrl import ReinforcementTwinning
+
+    # The steps are tested elsewhere and take minutes here; what is tested is that the snippet builds them.
+    monkeypatch.setattr(
+        ReinforcementTwinning,
+        "episode",
+        lambda self: self.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", self.referee.live)),
+    )
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    assert scope["report"]["real_cost"] > 0
+
+
+def test_its_files_exist():
+    for path in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
+        assert (ROOT / path).exists(), path
+
+
+@pytest.mark.slow
+def test_the_tutorial_runs_as_it_is_printed(tmp_path):
+    """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
+    code = "\n".join(re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL))
+    lines = [line for line in code.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) < 65
+    done = fresh_process.run(code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    upper, lower = map(float, re.findall(r"outlet': ([\d.e-]+)", done.stdout)[:2])
+    # The inflow is measured without noise: to rounding.
+    assert upper == pytest.approx(5e-5, rel=1e-9) and lower == pytest.approx(4e-5, rel=1e-9)
+
+
+def test_the_tutorial_says_what_the_check_says():
+    from rt_torchrl import PlantContractError
+
+    code = re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL)
+    scope = {"__name__": "tutorial"}
+    exec(code[0], scope)
+    with pytest.raises(PlantContractError, match="is too long for the eigenvalue"):
+        scope["check_plant"](scope["TwoTanks"](dt=600.0, horizon=1200.0), traced=False)
+
+
+# The two plants of quadrotor.md and heated_room.md are sound, and train as their pages say.
+
+
+PLANTS = {"quadrotor.md": ("Quadrotor", ["LQR"]), "heated_room.md": ("HeatedRoom", ["Thermostat", "PI"])}
+
+
+def printed(page):
+    return "\n".join(blocks(page, "python"))
+
+
+def parts(page):
+    """What the file of a page defines."""
+    scope = {"__name__": page.removesuffix(".md")}
+    exec(compile(printed(page), f"docs/{page}", "exec"), scope)
+    return scope
+
+
+@pytest.mark.parametrize("page", PLANTS)
+def test_its_plant_and_controllers_are_sound(page):
+    scope, (name, laws) = parts(page), PLANTS[page]
+    plant = scope[name]()
+    check_plant(plant, steps=10, traced=False)
+    for law in laws:
+        require_controller(law, scope[law], plant)
+    lines = [line for line in printed(page).splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert f"This file has {len(lines)} lines" in TEXTS[page]
+
+
+def test_the_regulator_of_a_right_data_sheet_holds_the_quadrotor_in_still_air():
+    scope = parts("quadrotor.md")
+    plant = scope["Quadrotor"]()
+    ideal = scope["RotorsAndDrag"](torch.tensor([1.0, 1.0, 0.06]))
+    start = plant.draw_initial_state(4, torch.Generator().manual_seed(0))
+    flown = scope["LQR"](plant).fly(start, torch.zeros(4, plant.n_steps, 1).double(), ideal)
+    target = torch.tensor([2.0, 2.0, 0.0, 0.0, 0.0, 0.0]).double()
+    assert (flown.states[:, -1] - target).abs().max() < 0.02
+
+
+def test_the_thermostat_switches_at_its_edges_alone():
+    scope = parts("heated_room.md")
+    plant = scope["HeatedRoom"]()
+    thermostat = scope["Thermostat"](plant)
+    room = torch.tensor([[20.9], [21.3], [21.7], [21.3]]).double()
+    on = torch.zeros(1, 1).double()
+    powers = []
+    for temperature in room:
+        power, on = thermostat.law(torch.cat([temperature, temperature]).unsqueeze(0), on)
+        powers.append(power.item())
+    assert powers == [3000.0, 3000.0, 0.0, 0.0]
+    day, night = (plant.occupied(torch.tensor(3600.0 * hour)).item() for hour in (12.0, 3.0))
+    assert day > 0.99 and night < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PLANTS)
+def test_the_file_of_the_page_trains(page, tmp_path):
+    """As a user runs it, with fewer and shorter steps; the run is then read back without the plant."""
+    file = tmp_path / page.replace(".md", ".py")
+    file.write_text(printed(page).replace("print(check_plant(plant))", ""), encoding="utf-8")
+    small = ("--episodes", "2", "--unseen", "6", "--untrained", "0", "--no-figures", "--threads", "1")
+    learner = "--twinning.learner"
+    few = (f"{learner}.critic-iterations", "20", f"{learner}.actor-iterations", "20")
+    done = fresh_process.run(file, *small, *few, "--log-dir", str(tmp_path / "run"), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text(encoding="utf-8"))["summary"]
+    found, true = metrics["closure"]["found"], metrics["closure"]["true"]
+    assert all(found[name] == pytest.approx(true[name], rel=1e-8) for name in true)  # measured without noise
+    learned = metrics["unseen"]["J_a_model_based"]["mean"]
+    classical = [baseline["J_a"]["mean"] for baseline in metrics["unseen"]["baselines"].values()]
+    assert learned < max(classical) and metrics["live"] == "model_based"
+    assert load_run(tmp_path / "run").plant.name == page.removesuffix(".md")
+    assert re.search("take the controller away: .*recipes/export.py", done.stdout)
+
+
+# The command that draws the gallery: its pictures are those of the page, and one training gives them.
+
+
+PAGE = (RECIPES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
+
+
+def test_its_pictures_are_those_of_the_page():
+    pictures = {f"{plant}_{name}" for plant, names in recipe("gallery").PICTURES.items() for name in names}
+    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", PAGE))
+    assert all((RECIPES.parent / "docs" / "gallery" / name).is_file() for name in pictures)
+
+
+def test_an_unknown_plant_is_refused():
+    with pytest.raises(ValueError, match="must be some of wind_turbine, flapping_wing, cryogenic_tank"):
+        recipe("gallery").Config(plants=("pendulum",))
+
+
+@pytest.mark.nightly
+def test_a_training_gives_the_pictures_of_a_plant(tmp_path):
+    gallery = recipe("gallery")
+    gallery.main(gallery.Config(plants=("wind_turbine",), quick=True, output=tmp_path / "out", log_dir=tmp_path))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        f"wind_turbine_{name}" for name in gallery.PICTURES["wind_turbine"]
+    }

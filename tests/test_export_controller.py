@@ -1,4 +1,4 @@
-"""The controller in C: in closed loop against the plant, the controller in torch, and exact filters."""
+"""Controller and twin in C: in closed loop against the plant, torch and exact filters; what is refused."""
 
 import ctypes
 import math
@@ -7,17 +7,21 @@ import re
 import pytest
 import torch
 from c_build import library, needs_compiler, printed
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from seeds_and_numbers import seeded
+from torch import nn
 
-from rt_torchrl import export_controller, shipped_plants
+from rt_torchrl import check_plant, export_controller, export_twin, shipped_plants
+from rt_torchrl.contract.check import PlantContractError
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export import c_compiler
 from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.export.controller import Controller
-from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.programs.c_source import CSource
 from rt_torchrl.trajectories.rollout import Rollout
 
 CLOSE = 1e-9
@@ -74,7 +78,7 @@ def law(plant):
 def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, monkeypatch):
     """Rotor speed and wind go in; the loops of C and of torch are closed one by one."""
     monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
-    plant = WindTurbine(observe=(observe,))
+    plant = WindTurbine(observe=(observe,), horizon=150.0)
     policy = law(plant)
     n_memory = len(plant.states) - 1
     agreement = export_controller(policy, tmp_path / "turbine.c", plant, name="turbine")
@@ -98,7 +102,7 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
         return command
 
     states, actions = flown(plant, start, exogenous, by_c)
-    assert len(actions) == 1200 and actions.std(0).min() > 0.0
+    assert len(actions) == 300 and actions.std(0).min() > 0.0
     expected, _ = flown(plant, start, exogenous, by_torch)
     size = expected.abs().amax(0)
     assert ((states - expected).abs() / size).max() < CLOSE
@@ -217,12 +221,9 @@ def test_linear_dynamics_against_the_matrix_exponential(tmp_path):
 
 def every_controller():
     for name, kind in shipped_plants().items():
-        plant = kind()
-        yield pytest.param(plant, plant.make_policy(seeded()), id=f"{name}-own")
-        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=seeded())
-        yield pytest.param(plant, mlp, id=f"{name}-mlp")
-        for observe in plant.observation_sets:
-            plant = kind(observe=(observe,))
+        sets = kind().observation_sets
+        for observe in sets or (None,):
+            plant = kind(observe=(observe,)) if sets else kind()
             yield pytest.param(plant, plant.make_policy(seeded()), id=f"{name}-{observe}")
     plant = WindTurbine(observe=("scheduled",))
     yield pytest.param(plant, GainScheduled(plant, generator=seeded()), id="gain-scheduled")
@@ -266,3 +267,180 @@ def test_a_program_in_c_that_includes_the_header(tmp_path, monkeypatch):
     in_c.start(1.2, 11.0)
     found = [in_c.step(1.2, 11.0) for _ in range(3)]
     assert [float(x) for x in in_a_program.split()] == found[-1]
+
+
+# What is no controller is refused; angles go the short way.
+
+
+class Guessed(Lagged):
+    """A plant whose filter depends on the closure."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state, action, exogenous, closure)
+        return torch.cat([rates[..., :1] + closure(state[..., 1:3])[..., 1:], rates[..., 1:]], -1)
+
+
+class Misnamed(LinearQuadratic):
+    controller_states = ("speed_error",)
+
+
+class Branching(LinearQuadratic):
+    def observe(self, t, state, exogenous):
+        return state if state.sum() > 0.0 else -state
+
+
+class Misstarted(Lagged):
+    def controller_start(self, measured, exogenous):
+        return measured[..., :1]
+
+
+class Turning(Lagged):
+    """The position is an angle, and the filter follows it."""
+
+    states = (
+        Lagged.states[0],
+        Signal(symbol="x", name="position", unit="m", low=-math.pi, high=math.pi, periodic=True),
+        *Lagged.states[2:],
+    )
+
+
+def test_an_angle_goes_the_short_way():
+    """From 3.1 over π to −3.1 is an advance of 2π − 6.2, which the filter df/dt = x − f follows."""
+    controller = Controller(Turning(dt=0.1), LinearGain(GAINS))
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    before, after = (torch.tensor([[x, 0.0]], dtype=torch.float64) for x in (3.1, -3.1))
+    memory = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
+    _, found = controller.advance(zero, memory, before, one, one, after)[0].tolist()
+    rate = (2.0 * math.pi - 6.2) / 0.1
+    exact = 3.1 + 0.1 * rate - rate + (3.0 - 3.1 + rate) * math.exp(-0.1)
+    assert found == pytest.approx(exact, abs=1e-6)
+
+
+REFUSED = {
+    "a state that depends on the closure": (Guessed, GAINS, r"integral, filtered_position\) depend on the closure"),
+    "a name that is no state": (Misnamed, [[1.0, 1.0]], "names speed_error; its states are position, velocity"),
+    "another number of first states": (Misstarted, GAINS, r"returns shape \(1, 1\); its last dimension must be 2"),
+    "a branch": (Branching, [[1.0, 1.0]], "controller of plant 'linear_quadratic' .* a branch of Python .*in observe"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_controller_is_refused(name, tmp_path):
+    kind, gains, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        export_controller(LinearGain(gains), tmp_path / "it.c", kind(dt=0.1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_check_of_a_plant_finds_a_misnamed_state():
+    with pytest.raises(PlantContractError, match="controller_states: 'speed_error' is no state"):
+        check_plant(Misnamed(dt=0.1), traced=False)
+
+
+@needs_compiler
+def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
+    right = CSource.text
+    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.25", "0.2500004"))
+    with pytest.raises(ValueError, match="the controller it in C differs from that in torch"):
+        export_controller(LinearGain([[0.25, 1.0]]), tmp_path / "it.c", LinearQuadratic(), name="it")
+    assert not list(tmp_path.iterdir())
+
+
+class Frozen(nn.Module):
+    """A policy that numpy computes, which no program can follow."""
+
+    def forward(self, e):
+        return torch.from_numpy(-0.1 * e.detach().numpy()[..., :1])
+
+
+def test_numbers_that_leave_torch_are_refused_with_their_line(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"\.numpy\(\) takes a number from a tensor that varies \(in forward, .*test_export_controller"
+    ):
+        export_controller(Frozen(), tmp_path / "it.c", LinearQuadratic())
+    assert not list(tmp_path.iterdir())
+
+
+# The twin in C: one interval of every plant against torch and against closed forms.
+
+
+def build(path):
+    """The function of the C file."""
+    step = getattr(library(path), f"{path.stem}_step")
+
+    def run(t, *arrays):
+        """The next state, written where the state was read."""
+        arrays = [c_array(x) for x in arrays]
+        step(ctypes.c_double(t), *arrays, arrays[0])
+        return torch.tensor(list(arrays[0]), dtype=torch.float64)
+
+    return run
+
+
+def closures():
+    for name, kind in shipped_plants().items():
+        plant = kind()
+        yield pytest.param(plant, plant.make_closure(seeded()), id=f"{name}-own")
+        yield pytest.param(plant, plant.closure, id=f"{name}-true")
+        if name != "pendulum":
+            yield pytest.param(plant, plant.make_neural_closure(seeded(), (16, 16)), id=f"{name}-mlp")
+
+
+@needs_compiler
+@pytest.mark.parametrize(("plant", "closure"), list(closures()))
+def test_twins_of_the_plants(plant, closure, tmp_path):
+    """A flight in C, whose states are fed back, ends where the plant's own flight ends."""
+    assert export_twin(closure, tmp_path / "twin.c", plant) < CLOSE
+    export_twin(closure, tmp_path / "twin.c", plant, name="twin")
+    step = build(tmp_path / "twin.c")
+    state, exogenous = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())
+    found, middle = state[0], torch.tensor([[0.5 * (a.low + a.high) for a in plant.actions]], dtype=torch.float64)
+    with torch.no_grad():
+        for k in range(50):
+            t = torch.tensor([k * plant.dt], dtype=torch.float64)
+            found = step(t.item(), found.tolist(), middle[0].tolist(), exogenous[0, k].tolist())
+            state = plant.step(t, state, middle, exogenous[:, k], closure).state
+    assert state.isfinite().all()
+    torch.testing.assert_close(found, state[0], rtol=CLOSE, atol=CLOSE)
+
+
+@needs_compiler
+def test_a_linear_twin_against_the_matrix_exponential(tmp_path):
+    matrix = [[0.05, 0.0], [-0.4, 0.2]]
+    plant = LinearQuadratic(dt=0.01)
+    export_twin(LinearClosure(matrix), tmp_path / "twin.c", plant, name="twin")
+    A, B, C, D = (torch.tensor(x, dtype=torch.float64) for x in (plant.A, plant.B, matrix, plant.D))
+    block = torch.zeros(4, 4, dtype=torch.float64)
+    block[:2] = torch.cat([A + C, B, D], 1)
+    start = [0.7, -0.4, 1.5, 0.3]
+    exact = torch.from_numpy(expm(0.01 * block.numpy()))[:2] @ torch.tensor(start, dtype=torch.float64)
+    found = build(tmp_path / "twin.c")(0.0, start[:2], start[2:3], start[3:])
+    # One step of the fourth order.
+    torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01**5)
+
+
+class BranchingClosure(nn.Module):
+    def forward(self, features):
+        return features if features.sum() > 0.0 else -features
+
+
+def test_a_branch_is_refused_with_its_line(tmp_path):
+    with pytest.raises(ValueError, match=r"twin of plant 'linear_quadratic' .* a branch of Python .*in forward"):
+        export_twin(BranchingClosure(), tmp_path / "twin.c", LinearQuadratic())
+    assert not list(tmp_path.iterdir())
+
+
+@needs_compiler
+def test_a_wrong_translation_of_a_twin_is_not_written(tmp_path, monkeypatch):
+    right = CSource.text
+    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.125", "0.1250004"))
+    with pytest.raises(ValueError, match="twin_step in C differs from the twin by"):
+        export_twin(LinearClosure([[0.0, 0.0], [0.125, 0.0]]), tmp_path / "twin.c", LinearQuadratic(), name="twin")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_machine_without_compiler_says_that_nothing_was_checked(tmp_path, monkeypatch):
+    monkeypatch.setattr(c_compiler, "COMPILERS", ("no_such_compiler",))
+    with pytest.warns(UserWarning, match="twin was not checked: there is no C compiler"):
+        assert export_twin(LinearClosure([[0.0, 0.0], [1.0, 0.0]]), tmp_path / "it.c", LinearQuadratic()) is None
+    assert (tmp_path / "it.c").exists() and (tmp_path / "it.h").exists()

@@ -64,7 +64,7 @@ class OracleConfig(RunConfig):
 
 def test_what_a_training_leaves_is_read_back(tmp_path):
     config = OracleConfig(
-        episodes=1, log_dir=tmp_path, compiled=False, unseen=2, figures_every=0, twinning=SMALL, noise=0.01
+        episodes=1, log_dir=tmp_path, compiled=False, unseen=2, figures=False, twinning=SMALL, noise=0.01
     )
     training = Run(config, config.plant())
     training.train()

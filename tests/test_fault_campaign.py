@@ -496,11 +496,6 @@ def require_true(plant, found, kind):
         assert error.max() < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["nan", "stuck_actuator", "raises"])
-def test_a_fault_of_the_oracle_plant_is_survived(kind):
-    require_faults_survived("linear_quadratic", kind)
-
-
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", [*OF_SENSORS, *OF_ACTUATORS, *OF_SYSTEMS])
 @pytest.mark.parametrize("name", PLANTS)

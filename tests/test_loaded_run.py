@@ -1,4 +1,4 @@
-"""Every run that a recipe can make is loaded again, and the recipe is found by what the run says of it."""
+"""Runs of every recipe are loaded again, found by what they say, and flown without a training."""
 
 import contextlib
 import dataclasses
@@ -12,10 +12,12 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
+from test_documentation import leave_finished_run
 from test_export_recipe import RECIPES, leave_run, recipe
 from test_hypotheses import Suspecting
 
 from rt_torchrl import Run, load_run
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.options import choices
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.command_line import load_recipe
@@ -30,14 +32,15 @@ WITHOUT_NEURAL_CLOSURE = ("pendulum",)
 
 
 def combinations():
-    """Plant, closure, policy and model-free policy; without what the recipes refuse."""
+    """Plant, closure, policy and model-free policy: every pair of policies, and every closure."""
     for plant in PLANTS:
         kind = config_class_of(RECIPES / f"{plant}.py")
-        closures, policies = choices(kind, "closure"), choices(kind, "policy")
-        for closure, policy, other in itertools.product(closures, policies, ("same", *policies)):
-            apart = "scheduled" in (policy, other) and other not in ("same", policy, "mlp")
-            if not apart and not (closure == "mlp" and plant in WITHOUT_NEURAL_CLOSURE):
+        (closure, *closures), policies = choices(kind, "closure"), choices(kind, "policy")
+        for policy, other in itertools.product(policies, ("same", *policies)):
+            if "scheduled" not in (policy, other) or other in ("same", policy, "mlp"):
                 yield plant, closure, policy, other
+        for further in closures if plant not in WITHOUT_NEURAL_CLOSURE else ():
+            yield plant, further, policies[0], "same"
 
 
 @pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
@@ -60,19 +63,20 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize("plant", CHOICES)
+@pytest.mark.parametrize(
+    "plant", [pytest.param("wind_turbine", marks=pytest.mark.slow), "flapping_wing", "cryogenic_tank"]
+)
 def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path, monkeypatch):
-    made = load_recipe(RECIPES / f"{plant}.py")
-    config = made.Config(
-        **CHOICES[plant], policy="mlp", hidden=(3,), episodes=1, unseen=2, untrained=0, log_dir=tmp_path, twinning=SMALL
-    )
-    # A hundred frames of the drone's flight show nothing of its settings.
+    made, drawn = load_recipe(RECIPES / f"{plant}.py"), plant == "wind_turbine"
+    small = {"episodes": 1, "unseen": 2, "untrained": 0, "figures": drawn, "figures_every": 0, "twinning": SMALL}
+    config = made.Config(**CHOICES[plant], **small, policy="mlp", hidden=(3,), log_dir=tmp_path)
+    # A hundred frames of a flight show nothing of its settings.
     monkeypatch.setattr(made, "animate", None, raising=False)
     made.main(config)
     run = load_run(tmp_path)
     assert settings_of(run.config, plant) == settings_of(config, plant) and run.plant.cost == config.plant().cost
     assert run.plant.observations == config.plant().observations != made.Config().plant().observations
-    assert (tmp_path / "figures" / "exogenous.png").exists()
+    assert (tmp_path / "figures" / "exogenous.png").exists() == drawn
     with pytest.raises(ValueError, match="observe is"):
         made.main(dataclasses.replace(config, observe=("paper",), resume=True))
 
@@ -300,3 +304,73 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
         ValueError, match=r"hypotheses in .*weights.pt do not fit: plant 'linear_quadratic' suspects no"
     ):
         load_run(tmp_path, RunConfig, plant=LinearQuadratic(horizon=2.0))
+
+
+# Episodes and figures of a finished run, without a training.
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return load_run(leave_finished_run(tmp_path_factory.mktemp("what_if") / "run"))
+
+
+def test_an_episode_is_that_of_the_plant_stepped_by_hand(run):
+    wind = torch.linspace(9.0, 13.0, 40, dtype=torch.float64)[:, None]
+    policy = run.policy("model_based")
+    for system, plant, closure in (("real", run.plant, run.plant.closure), ("twin", run.physics, run.closure)):
+        flown = run.simulate(policy, wind, on=system, seed=3)
+        state = flown.states[0]
+        with torch.no_grad():
+            for k in range(40):
+                t = torch.tensor(k * plant.dt, dtype=torch.float64)
+                step = plant.step(t, state, policy(plant.observe(t, state, wind[k])), wind[k], closure)
+                torch.testing.assert_close(flown.states[k + 1], step.state, rtol=1e-9, atol=1e-9)
+                state = step.state
+
+
+def test_what_is_left_out_is_drawn_and_the_same_seed_is_the_same_episode(run):
+    policy = run.policy(run.live)
+    one, two, three = (run.simulate(policy, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one.states, two.states) and not torch.equal(one.exogenous, three.exogenous)
+    start = torch.stack([one.states[0], three.states[0]])
+    both = run.simulate(policy, torch.stack([one.exogenous, three.exogenous]), start)
+    torch.testing.assert_close(both.states, torch.stack([one.states, three.states]), rtol=1e-9, atol=1e-9)
+
+
+def test_a_classical_controller_flies_too(run):
+    law = JonkmanController(run.plant)
+    flown = run.simulate(law, seed=1)
+    own = law.fly(flown.states[:1], flown.exogenous[None])
+    assert torch.equal(flown.states, own.states[0])
+
+
+def test_impossible_requests_are_refused(run):
+    policy = run.policy("model_based")
+    for arguments, message in (
+        ({"on": "model"}, "on='model' must be real or twin"),
+        ({"exogenous": torch.ones(5, 3)}, "a column for each input"),
+        ({"exogenous": torch.ones(5)}, "a row for each control interval"),
+        ({"initial_state": torch.ones(2)}, r"initial_state of shape \(2,\) must have the shape \(6,\)"),
+        ({"exogenous": torch.ones(2, 5, 1), "initial_state": torch.ones(3, 6)}, "has 2 episodes, others 3"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run.simulate(policy, **arguments)
+    with pytest.raises(ValueError, match="figure 'state' does not exist in this run; choose one of actions"):
+        run.figure("state")
+
+
+def test_figures_show_the_episode_that_is_given(run):
+    flown = run.simulate(run.policy("model_based"), torch.full((30, 1), 12.5), seed=5)
+    ax = run.figure("states", flown).axes[0]
+    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
+    assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy())
+    assert {"states", "actions", "learning_curves", "power_and_speed"} <= set(run.figure_names())
+
+
+def test_the_table_has_a_row_for_each_episode(run):
+    assert run.table()["real_cost"].tolist() == pytest.approx([0.1, 0.09])
+
+
+def test_without_results_the_message_names_the_file(run, tmp_path):
+    with pytest.raises(ValueError, match=r"metrics.json cannot be read"):
+        dataclasses.replace(run, folder=tmp_path).table()

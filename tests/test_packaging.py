@@ -1,10 +1,14 @@
-"""The folder ``envs`` is ``rt_torchrl.envs``, in a checkout and in a built wheel."""
+"""What a user installs: folders, wheel and command, public names, and what a start has to wait for."""
 
+import ast
 import importlib
 import importlib.metadata
 import importlib.util
+import os
+import re
 import subprocess
 import sys
+import venv
 import zipfile
 from pathlib import Path
 
@@ -13,6 +17,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import rt_torchrl
+from rt_torchrl.runs import console
 
 ROOT = Path(__file__).parent.parent
 MISSING = [name for name in ("build", "hatchling") if importlib.util.find_spec(name) is None]
@@ -119,3 +124,252 @@ def test_wheel_works_without_the_checkout(wheel, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).is_relative_to(tmp_path.resolve())
+
+
+# People import what they use from ``rt_torchrl`` itself, and wait for nothing that they do not use.
+
+
+STUB = ast.parse((ROOT / "rt_torchrl" / "__init__.pyi").read_text(encoding="utf-8"))
+HOMES = {
+    alias.name: f"rt_torchrl.{node.module}"
+    for node in STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+"""The module that each public name comes from."""
+ROOMS_OF = {
+    "accuracy.py": {"evaluation", "runs", "study", "trajectories", "twinning"},
+    "asynchronous.py": {"runs"},
+    "benchmark.py": {"runs", "trajectories"},
+    "cascaded_tanks.py": {"figures", "fit", "runs"},
+    "compare.py": {"figures", "runs", "study"},
+    "export.py": {"export", "runs"},
+    "gallery.py": {"runs"},
+    "identify.py": {"fit", "figures", "runs"},
+    "in_service.py": {"runs", "systems"},
+    "jitter.py": {"runs", "systems"},
+    "limit.py": {"evaluation", "control", "runs", "study"},
+    "memory.py": {"evaluation", "figures", "runs"},
+    "pareto.py": {"runs", "study"},
+    "partial.py": {"runs", "study"},
+    "record_log.py": {"fit", "runs"},
+    "soak.py": {"runs"},
+    "study.py": {"study", "runs"},
+    "sweep.py": {"figures", "runs", "study"},
+    "unknown.py": {"study", "runs"},
+    "worth.py": {"figures", "runs", "study"},
+}
+"""Recipes that are the command line of a room, and the rooms whose internal names they use."""
+
+
+def sources():
+    """The Python that people read first: every recipe, and every code block of the README and the tutorial."""
+    for path in sorted((ROOT / "recipes").glob("*.py")):
+        yield path.name, path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "docs" / "own_plant.md"):
+        blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+        assert blocks, path
+        yield path.name, "\n".join(blocks)
+
+
+def imports_of_rooms(code):
+    """Pairs of a module of the library, not a plant's, and a name that is imported from it."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            found = [(alias.name, "") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found = [(node.module or "", alias.name) for alias in node.names]
+        else:
+            continue
+        for module, name in found:
+            parts = module.split(".")
+            if parts[0] == "rt_torchrl" and parts[1:2] not in ([], ["envs"]):
+                yield module, name
+
+
+@pytest.mark.parametrize(("file", "code"), [pytest.param(*source, id=source[0]) for source in sources()])
+def test_public_names_come_from_the_top(file, code):
+    for module, name in imports_of_rooms(code):
+        assert name not in HOMES, f"{file}: import {name} from rt_torchrl, not from {module}"
+        assert module.split(".")[1] in ROOMS_OF.get(file, ()), f"{file} imports {name} from {module}"
+
+
+@pytest.mark.parametrize("name", sorted(HOMES))
+def test_every_name_is_what_its_module_defines(name):
+    assert getattr(rt_torchrl, name) is getattr(importlib.import_module(HOMES[name]), name)
+
+
+def test_type_checkers_and_people_see_the_same_names():
+    (listed,) = (ast.literal_eval(n.value) for n in STUB.body if isinstance(n, ast.Assign))
+    assert sorted(listed) == sorted(HOMES) == sorted(rt_torchrl.__all__) == sorted(dir(rt_torchrl))
+
+
+def test_a_name_that_does_not_exist_is_refused():
+    with pytest.raises(AttributeError, match="Plnt"):
+        rt_torchrl.Plnt  # noqa: B018
+
+
+def test_the_import_waits_for_nothing():
+    """A user who asks for a version, or misspells a command, needs neither PyTorch nor TorchRL."""
+    code = (
+        "import sys, rt_torchrl; rt_torchrl.__version__, dir(rt_torchrl)\n"
+        "print([name for name in ('torch', 'torchrl', 'sklearn', 'scipy', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_the_help_of_a_recipe_waits_for_pytorch_alone():
+    code = (
+        "import contextlib, pathlib, runpy, sys\n"
+        "for path in sys.argv[1:]:\n"
+        "    sys.argv, sys.path[0] = [path, '--help'], str(pathlib.Path(path).parent)\n"
+        "    with contextlib.suppress(SystemExit):\n"
+        "        runpy.run_path(path, run_name='__main__')\n"
+        "late = ('matplotlib', 'scipy', 'sklearn', 'pandas', 'torch._dynamo', 'torch._inductor', 'tensordict',\n"
+        "        'torchrl', 'torchdiffeq', 'onnx', 'jax')\n"
+        "print([name for name in late if name in sys.modules])"
+    )
+    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py"))]
+    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
+    helped = [line for line in done.stdout.splitlines() if line.startswith("usage: ")]
+    assert (len(helped), done.stdout.splitlines()[-1]) == (len(recipes), "[]"), done.stdout + done.stderr
+
+
+# The command rt-torchrl: what it lists, what it runs, and the wheel that gives it.
+
+
+RECIPES = {path.stem for path in (ROOT / "recipes").glob("*.py")}
+
+
+def test_it_lists_every_recipe_with_its_purpose(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    console.main([])
+    bare = capsys.readouterr().out
+    console.main(["--help"])
+    assert capsys.readouterr().out == bare and max(map(len, bare.splitlines())) <= 80
+    listed = {line.split()[0] for line in bare.splitlines() if line.startswith("  ") and line[2] != " "}
+    assert listed == RECIPES | {"FILE.py"} and "Finished runs side by side" in bare
+
+
+def test_the_list_waits_for_no_library():
+    program = "import sys; from rt_torchrl.runs.console import main; main([]); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+def test_an_unknown_recipe_is_refused_with_the_nearest():
+    with pytest.raises(SystemExit, match="no recipe 'wind_turbin'; did you mean wind_turbine"):
+        console.main(["wind_turbin"])
+    with pytest.raises(SystemExit, match=r"mine\.py does not exist"):
+        console.main(["mine.py"])
+
+
+def test_it_runs_a_file_as_a_script(tmp_path, monkeypatch, capsys):
+    (tmp_path / "beside.py").write_text("WORD = 'found'\n")
+    own = tmp_path / "own.py"
+    own.write_text("import sys\nfrom beside import WORD\nif __name__ == '__main__':\n    print(WORD, sys.argv[1:])\n")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    console.main([str(own), "--quick"])
+    assert capsys.readouterr().out == "found ['--quick']\n"
+
+
+def test_names_may_have_hyphens():
+    assert console.recipe("wind-turbine") == ROOT / "recipes" / "wind_turbine.py"
+
+
+def test_the_wheel_holds_the_recipes_and_the_command(wheel):
+    archive = zipfile.ZipFile(wheel)
+    names = archive.namelist()
+    held = {Path(name).stem for name in names if name.startswith("rt_torchrl/recipes/") and name.count("/") == 2}
+    assert held == RECIPES and "rt_torchrl/recipes/benchmarking/case.py" in names
+    (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
+    assert "rt-torchrl = rt_torchrl.runs.console:main" in archive.read(entry_points).decode()
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(bool(MISSING), reason="building a wheel needs build and hatchling")
+def test_an_installed_wheel_trains_reports_and_is_read_back(wheel, tmp_path):
+    """In an environment that shares only the dependencies with this one, from a folder outside the checkout."""
+    home = tmp_path / "env"
+    venv.create(home, with_pip=False)
+    (site,) = home.glob("lib/python*/site-packages")
+    zipfile.ZipFile(wheel).extractall(site)
+    shared = next(path for path in sys.path if path.endswith("site-packages"))
+    (site / "shared.pth").write_text(shared + "\n")
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    program = "from rt_torchrl.runs.console import main; main()"
+
+    def run(*words):
+        command = [str(home / "bin" / "python"), "-c", program, *words]
+        return subprocess.run(command, cwd=tmp_path, env=clean, capture_output=True, text=True)
+
+    trained = run("wind_turbine", "--quick", "--threads", "1", "--no-figures", "--log-dir", "run")
+    assert trained.returncode == 0 and "recipes/" not in trained.stdout, trained.stderr
+    exported = run("export", "run", "--formats", "c")
+    assert exported.returncode == 0 and list((tmp_path / "run" / "exported").glob("*.c")), exported.stderr
+
+
+# Between a command and its first episode, a recipe loads nothing that this episode does not use.
+
+
+FIRST_EPISODES = """
+import runpy, sys
+from rt_torchrl import atomic_file
+
+write = atomic_file.write_atomically
+
+class Done(BaseException):
+    pass
+
+def until_checkpoint(path, content):
+    if path.name == "checkpoint.pt":  # which is written at the end of an episode
+        raise Done
+    write(path, content)
+
+atomic_file.write_atomically = until_checkpoint
+folder, *recipes = sys.argv[1:]
+for path in recipes:
+    sys.argv = [path, "--quick", "--figures-every", "2", "--threads", "1", "--log-dir", f"{folder}/{len(path)}"]
+    if "flapping_wing" not in path:  # one learns from a controller, which takes longer than its first episode
+        sys.argv += ["--start", "random"]
+    try:
+        runpy.run_path(path, run_name="__main__")
+    except Done:
+        late = ("matplotlib", "onnx", "jax", "casadi", "gymnasium", "torch._inductor.compile_fx", "torchrl.collectors")
+        print("late:", [name for name in late if name in sys.modules], flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_the_first_episodes_load_only_what_they_use(tmp_path):
+    recipes = [str(ROOT / "recipes" / f"{name}.py") for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
+    command = [sys.executable, "-c", FIRST_EPISODES, str(tmp_path), *recipes]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    said = [line for line in done.stdout.splitlines() if line.startswith("late: ")]
+    assert said == ["late: []"] * 3, done.stdout + done.stderr
+
+
+def test_every_recipe_says_that_it_starts_before_it_loads_pytorch():
+    """The import of PyTorch fails here; it comes after the line, or the line would be missing."""
+    code = (
+        "import contextlib, runpy, sys\n"
+        "sys.modules['torch'] = None\n"
+        "for path in sys.argv[1:]:\n"
+        "    sys.path.insert(0, 'recipes')\n"
+        "    with contextlib.suppress(ImportError):\n"
+        "        runpy.run_path(path, run_name='__main__')\n"
+        "    print('ended', file=sys.stderr)"
+    )
+    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py"))]
+    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr.splitlines() == ["loading PyTorch and TorchRL", "ended"] * len(recipes), done.stderr
+
+
+@pytest.mark.parametrize("given, expected", [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_threads_of_a_program_wait_without_a_core_unless_its_user_says_otherwise(given, expected):
+    code = "import os; from rt_torchrl import begin_loading; begin_loading(); print(os.environ['OMP_WAIT_POLICY'])"
+    without = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=without | given, capture_output=True, text=True)
+    assert done.stdout.strip() == expected, done.stderr

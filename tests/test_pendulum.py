@@ -217,19 +217,6 @@ def require_quiet(done):
     assert not re.search(r"torch\.jit|CUDA_HOME|\[torchrl\]|Warning", done.stdout), done.stdout
 
 
-@pytest.mark.slow
-def test_the_recipe_trains_on_gymnasium(tmp_path):
-    small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
-    small += ["--twinning.learner.critic-iterations", "2", "--twinning.learner.actor-iterations", "2"]
-    small += ["--twinning.planner.iterations", "1", "--twinning.virtual-episodes", "2"]
-    done = fresh_process.run(RECIPE, *small, "--log-dir", str(tmp_path))
-    assert done.returncode == 0, done.stderr[-3000:]
-    require_quiet(done)
-    found = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]["found"]
-    # One record of 40 intervals in single precision.
-    assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)
-
-
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)])
 def test_it_swings_up_within_ten_real_episodes(tmp_path, seed):
     done = fresh_process.run(RECIPE, "--seed", str(seed), "--log-dir", str(tmp_path))

@@ -1,23 +1,41 @@
-"""The results in numbers: values that JSON cannot write, and the choice of the better policy."""
+"""Results of a run: numbers, tables, its bar, loggers, callbacks and files of options."""
 
+import csv
 import dataclasses
 import json
+import math
+import struct
+import time
 from unittest.mock import Mock
 
+import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_algorithm import STEPS, twinning
+from test_export_recipe import RECIPES
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite
+from rt_torchrl.envs.pendulum.plant import UniformRod
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.runs import results
-from rt_torchrl.runs.results_table import results_table
+from rt_torchrl.plants.closures import described_weights
+from rt_torchrl.runs import progress, results
+from rt_torchrl.runs.callbacks import EarlyStopping
+from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.loaded_run import config_class_of
+from rt_torchrl.runs.progress import Progress
+from rt_torchrl.runs.results_table import SCREEN, closure_lines, fit_lines, next_steps, results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.engines.parallel import watched_compilation
+from rt_torchrl.twinning.config import TwinningConfig
 
 
 def refused(name):
@@ -105,3 +123,316 @@ def test_clones_are_flown_once_and_other_policies_each():
     each = of_each_role({"model_based": first, "model_free": other}, costs)
     assert flown == [first, other] and torch.equal(each["model_free"], unseen.control_costs(other))
     assert not torch.equal(each["model_free"], each["model_based"])
+
+
+# The closure's weights on the terminal.
+
+
+def test_true_weights_are_shown_where_they_are_known():
+    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}}
+    bare = [["a", "1", "1.5"], ["b", "2", "2.5"]]
+    for unknown in ({}, {"true": None}, {"true": {"other": 1.0}}):
+        shown = [line.split() for line in closure_lines(closure | unknown)]
+        assert shown == [["closure", "weight", "start", "found"], *bare]
+    shown = [line.split() for line in closure_lines(closure | {"true": {"a": 1.25}})]
+    assert shown[0][-1] == "true" and [line[-1] for line in shown[1:]] == ["1.25", "-"]
+
+
+def test_units_and_meanings_are_shown_where_the_closure_states_them():
+    described = described_weights(UniformRod.guess(0.5))
+    closure = {"start": {"mass": 0.5, "length": 0.5}, "found": {"mass": 1.0, "length": 0.75}, "described": described}
+    shown = closure_lines(closure)
+    assert shown[1].split() == ["mass", "[kg]", "0.5", "1", "mass", "of", "the", "rod"]
+    assert shown[2].split() == ["length", "[m]", "0.5", "0.75", "length", "of", "the", "rod"]
+    assert described_weights(torch.nn.Linear(1, 1)) == {}
+
+
+def test_standard_errors_stand_beside_the_weights():
+    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "true": {"a": 1.25, "b": 2.0}}
+    shown = [line.split() for line in closure_lines(closure, errors={"a": 0.25, "b": None})]
+    assert shown[1:] == [["a", "1", "1.5", "0.25", "1.25"], ["b", "2", "2.5", "-", "2"]]
+    assert shown[0] == ["closure", "weight", "start", "found", "std.", "error", "true"]
+
+
+# The bar of a training says what is under way, and moves while it is.
+
+
+def test_it_names_each_step_as_it_begins():
+    told = []
+    twinning().episode(told.append)
+    assert told == STEPS and set(progress.WORDS) == {"start", *STEPS}
+
+
+def test_it_moves_while_a_step_is_under_way(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "IN_FILE", 0.05)
+    with Progress(3) as bar:
+        bar.doing("assimilate")
+        time.sleep(1.2)
+        bar.episode({"real_cost": 0.25, "live": "model_free"})
+        bar.doing("drawing figures")
+    shown = capsys.readouterr().err
+    assert "starting" not in shown.splitlines()[-1]
+    assert "assimilating 0 s" in shown and "assimilating 1 s" in shown and "1/3" in shown
+    assert "real 0.25, live model-free; drawing figures" in shown
+
+
+def test_it_says_when_another_twin_is_believed(capsys):
+    record = {"real_cost": 0.25, "live": "model_free", "J_p": 1.0}
+    with Progress(4) as bar:
+        for episode, believed in enumerate((None, "pitch lag, late by 3", "pitch lag, late by 3", None)):
+            bar.episode(record | {"episode": episode, "believed": believed})
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "is the likeliest" in line]
+    assert lines == [
+        "episode 2: the twin with 'pitch lag, late by 3' is the likeliest; J_p and closure are its own",
+        "episode 4: the twin alone is the likeliest; J_p and closure are its own",
+    ]
+
+
+def test_it_says_when_the_compiler_is_at_work(capsys):
+    with Progress(1) as bar:
+        bar._compilation(True)
+        bar.doing("plan")
+        bar._compilation(False)
+    assert "planning 0 s, compiling" in capsys.readouterr().err
+
+
+def test_compilation_is_watched():
+    states = []
+    with watched_compilation(states.append):
+        # The compiler itself is watched by nobody, and would take twenty seconds.
+        torch.compile(lambda x: torch.sin(x) + 1.0, backend="eager")(torch.ones(3, device="cpu"))
+    assert states[0] is True and states[-1] is False
+    handler = torch._dynamo.callback_handler
+    assert not handler.start_callbacks and not handler.end_callbacks
+
+
+# Weights & Biases and MLflow beside TensorBoard, without a network: what they are told is read back.
+
+
+BLOCK = 2**15
+REAL = "cost/real episode (live policy)"
+
+
+def trained(folder, logger):
+    config = RunConfig(
+        episodes=2, log_dir=folder, unseen=3, untrained=0, figures=False, loggers=(logger,), twinning=SMALL
+    )
+    metrics = Run(config, LinearQuadratic(horizon=2.0)).train()
+    return [episode["real_cost"] for episode in metrics["episodes"]]
+
+
+def content(log):
+    """The records of a file of Weights & Biases: a header of 7 bytes, then LevelDB's log, in blocks of 32 KiB."""
+    place, found = 7, b""
+    while place + 7 <= len(log):
+        left = BLOCK - place % BLOCK
+        if left < 7:  # no room for the head of a chunk: check sum, length and kind
+            place += left
+            continue
+        (length,) = struct.unpack("<H", log[place + 4 : place + 6])
+        found += log[place + 7 : place + 7 + length]
+        place += 7 + length
+    return found
+
+
+def test_weights_and_biases_has_the_curves_and_the_options(tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb", reason="needs wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    costs = trained(tmp_path / "run", "wandb")
+    assert wandb.run is None  # so that the next run of this process begins another one
+    wandb.teardown()  # as at the end of the process, which writes the last block
+    (file,) = (tmp_path / "run").rglob("*.wandb")
+    written = content(file.read_bytes())
+    for said in (REAL, "twinning.virtual_episodes", *map(repr, costs)):
+        assert said.encode() in written, said
+
+
+def test_mlflow_has_the_curves_and_the_options(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow", reason="needs mlflow")
+    monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    costs = trained(tmp_path / "run", "mlflow")
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'run' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("linear_quadratic")
+    (run,) = client.search_runs([experiment.experiment_id])
+    name = "cost/real episode live policy"  # MLflow takes no brackets
+    assert [point.value for point in client.get_metric_history(run.info.run_id, name)] == pytest.approx(costs)
+    assert run.data.params["twinning.virtual_episodes"] == "2" and run.info.status == "FINISHED"
+    assert mlflow.active_run() is None
+
+
+# Callbacks, early stopping, loggers, files of options, and the summary at the end of a run.
+
+
+TURBINE = config_class_of(RECIPES / "wind_turbine.py")
+
+
+def episodes(costs, live="model_based"):
+    return [{"live": live, "real_cost": 7.0, "J_a_model_based": cost} for cost in costs]
+
+
+def test_early_stopping_waits_for_its_patience():
+    stop = EarlyStopping(patience=2, least_gain=0.1)
+    assert stop(episodes([5.0, 4.0, 3.9])) is None  # one episode without a gain of a tenth
+    assert stop(episodes([5.0, 4.0, 3.9, 3.7])) == "no gain of 10 % in the last 2 episodes"
+    # Small gains add up to one that counts.
+    assert stop(episodes([5.0, 4.0, 3.9, 3.5])) is None
+    assert stop(episodes([None, None, 4.0])) is None  # a policy that diverges costs more than any number
+    assert stop(episodes([3.0, 2.0, 1.0], live="model_free")) == "no gain of 10 % in the last 2 episodes"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"), [({"patience": 0}, "patience=0"), ({"patience": 1, "least_gain": 1.0}, "least_gain=1.0")]
+)
+def test_impossible_patience_is_refused(arguments, name):
+    with pytest.raises(ValueError, match=name):
+        EarlyStopping(**arguments)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run of at most four episodes that a callback ends after two, with a CSV logger."""
+    folder, seen = tmp_path_factory.mktemp("habits") / "run", []
+
+    def end_after_two(found):
+        seen.append(len(found))
+        return "two are enough" if len(found) == 2 else None
+
+    config = RunConfig(
+        episodes=4, log_dir=folder, unseen=3, untrained=0, figures=False, loggers=("csv",), twinning=SMALL
+    )
+    metrics = Run(config, LinearQuadratic(horizon=2.0), callbacks=[end_after_two]).train()
+    return folder, metrics, seen
+
+
+def test_a_callback_ends_the_training_and_its_results_are_written(stopped):
+    folder, metrics, seen = stopped
+    assert seen == [1, 2] and len(metrics["episodes"]) == 2
+    assert json.loads((folder / "metrics.json").read_text())["summary"]["cost_of_learning"]["episodes"] == 2
+
+
+def test_the_csv_logger_has_the_curves_and_the_final_costs(stopped):
+    folder, metrics, _ = stopped
+    (curve,) = (folder / "csv" / "scalars").rglob("real episode (live policy).csv")
+    rows = [(int(step), float(value)) for step, value in csv.reader(curve.open())]
+    assert rows == [(k, pytest.approx(episode["real_cost"])) for k, episode in enumerate(metrics["episodes"])]
+    (final,) = (folder / "csv" / "scalars" / "final").glob("J_a live.csv")
+    live = metrics["summary"]["unseen"][f"J_a_{metrics['summary']['live']}"]["mean"]
+    assert float(final.read_text().split(",")[1]) == pytest.approx(live)
+    assert "twinning.virtual_episodes: 2" in next((folder / "csv" / "texts").glob("*")).read_text()
+
+
+def test_tensorboard_has_options_final_costs_and_the_table(stopped):
+    folder, metrics, _ = stopped
+    events = EventAccumulator(str(folder)).Reload()
+    assert "final/J_a live" in events.Tags()["scalars"] and "results/text_summary" in events.Tags()["tensors"]
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    assert b"twinning.virtual_episodes" in content
+
+
+def test_unknown_loggers_and_missing_packages_are_refused(monkeypatch):
+    with pytest.raises(SystemExit):
+        from_command_line(TURBINE, ["--loggers", "excel"])
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="loggers='wandb' needs a package that is not installed: pip install wandb"):
+        RunConfig(loggers=("wandb",))
+
+
+def test_the_options_of_a_run_run_again(tmp_path):
+    asked = from_command_line(TURBINE, ["--policy", "bias", "--seed", "3", "--log-dir", str(tmp_path), "--overwrite"])
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps(settings_of(asked, "wind_turbine") | {"ran": []}, default=str))
+    again = from_command_line(TURBINE, ["--config", str(file), "--seed", "4"])
+    assert (again.policy, again.seed, again.twinning) == ("bias", 4, asked.twinning)
+    assert (again.log_dir, again.overwrite, again.config) == (None, False, file)
+
+
+def test_a_file_may_hold_a_few_options(tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({"episodes": 7, "twinning": {"planner": {"iterations": 3}}}))
+    found, default = from_command_line(TURBINE, ["--config", str(file)]), from_command_line(TURBINE, [])
+    assert (found.episodes, found.twinning.planner.iterations) == (7, 3)
+    assert found.twinning.planner.realisations == default.twinning.planner.realisations == 50
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "config=.*cannot be read"),
+        ("[1]", "must hold an object"),
+        ('{"epsodes": 3}', "has no option epsodes"),
+        ('{"episodes": 0}', "episodes=0 must be at least 1"),
+        ("[" * 100_000, "config=.*cannot be read: maximum recursion depth"),
+        ('{"twinning": ' * 100_000, "config=.*cannot be read: maximum recursion depth"),
+        ('\ufeff{"episodes": 3}', "config=.*byte-order mark; save it as UTF-8 without one"),
+        ('{"recipe": "x"}', "config=.*its recipe is 'x'; it must be an object"),
+        ('{"recipe": 0}', "config=.*its recipe is 0; it must be an object"),
+        ('{"recipe": {"file": 3}}', "config=.*its recipe is .*it must be an object"),
+        ('{"recipe": {"file": "/a/flapping_wing.py"}}', "is of the recipe flapping_wing.py, not of wind_turbine.py"),
+    ],
+)
+def test_a_file_that_cannot_be_carried_out_is_refused(content, message, tmp_path):
+    file = tmp_path / "config.json"
+    file.write_text(content, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        from_command_line(TURBINE, ["--config", str(file)])
+
+
+def many_weights(metrics, count):
+    """Results as those of a plant with a classical controller, five merits and a closure of many weights."""
+    merit = {f"quantity {k}": {"mean": 1.0, "median": 1.0} for k in range(5)}
+    cost = {"mean": 2.0, "confidence_interval": [1.0, 3.0]}
+    unseen = metrics["summary"]["unseen"] | {"merit": dict.fromkeys(("model_based", "model_free"), merit)}
+    unseen |= {"baselines": {"PI": {"J_a": cost, "merit": merit}}, "categories": {}}
+    start = {f"c{k}": 1.0 for k in range(count)}
+    found = start | {"c3": 2.0, "c5": 1.5, "c7": None}
+    closure = {"start": start, "found": found, "true": {}, "described": {}}
+    return metrics | {"summary": metrics["summary"] | {"unseen": unseen, "closure": closure}}
+
+
+def test_the_summary_fits_one_screen_and_shows_the_weights_that_changed(stopped, tmp_path):
+    metrics = many_weights(stopped[1], 40)
+    shown = results_table(metrics).splitlines() + ["results in …"] + next_steps(metrics, tmp_path).splitlines()
+    assert len(shown) <= SCREEN + 1  # the first line is empty
+    assert all(any(line.split()[:1] == [name] for line in shown) for name in ("c3", "c5", "c7"))
+    assert any("more, which have changed less, are in metrics.json" in line for line in shown)
+
+
+def test_the_next_step_follows_from_the_results(stopped, tmp_path):
+    metrics = stopped[1]
+    live = metrics["summary"]["live"]
+    cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
+
+    def said(better, controller, planner=None, **summary):
+        unseen = metrics["summary"]["unseen"] | {"baselines": {"PI": {"J_a": {"mean": controller}}}}
+        found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
+        config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
+        return next_steps({"summary": found}, tmp_path, config)
+
+    other = {"model_based": "model_free", "model_free": "model_based"}[live]
+    assert "recipes/export.py" in said(live, 2.0 * cost)
+    assert "PI is better than the live policy" in said(live, 0.5 * cost)
+    assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
+    assert said("model_free", math.inf, live="model_free").endswith("--role model_free")
+    planned = said("model_based", math.inf, "receding_horizon", live="model_based")
+    assert planned.endswith("--what twin")
+    beside = said("model_based", math.inf, "receding_horizon", live="model_based", believed="lags")
+    assert "the model that it plans on" in planned and "the twin with lags, on which it does not plan," in beside
+
+
+def test_a_small_run_ends_early_by_its_option(tmp_path, monkeypatch):
+    monkeypatch.setattr(EarlyStopping, "cost", staticmethod(lambda episode: 1.0))
+    metrics = small_run(tmp_path / "run", episodes=4, patience=1, untrained=0).train()
+    assert len(metrics["episodes"]) == 2
+
+
+def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
+    rms = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None, "height [m]": 2.0}
+    found = {"rms": rms, "segment": 0, "standard_errors": {}}
+    line = "RMS rotor_speed 0.0123 rad/s, shares diverges, height 2 m"
+    assert fit_lines(found) == [f"  twin over its last records: {line}"]
+    assert fit_lines(found | {"segment": 22}) == [f"  twin over segments of 22 intervals: {line}"]
+    assert fit_lines({"rms": {}, "segment": 0, "standard_errors": {}}) == fit_lines(None) == []
+    record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
+    record |= {f"rms/{name}": value for name, value in rms.items()}
+    assert progress(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"

@@ -1,18 +1,32 @@
-"""A run folder: who may write in it, what is overwritten, and with which options a run is resumed."""
+"""A run folder and its files: who writes, what is overwritten and resumed, and damage that is noticed."""
 
 import dataclasses
+import errno
 import json
+import os
+import pickle
+import stat
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
+from small_runs import SMALL, small_run
+from torch import nn
 
+from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.run_settings import require_same
 from rt_torchrl.runs.settings import BESIDE, config_of, read_settings
+from rt_torchrl.runs.tensor_file import load_tensors, plain, save_tensors
 
 HOLDER = """
 import sys
@@ -188,3 +202,369 @@ def test_what_ran_is_kept_for_every_start(tmp_path):
     assert settings["plant"] == "p"
     options = {name: value for name, value in settings.items() if name not in BESIDE}
     assert config_of(RunConfig, options) == RunConfig(log_dir=tmp_path, quick=True, resume=True)
+
+
+# Files that a run writes: whole or not at all, without code, and with their damage noticed.
+
+
+CONTENT = {
+    "policy": {"gain": torch.linspace(0.0, 1.0, 300, dtype=torch.float64)},
+    "pair": (1, 0.5),
+    "names": ["model_free", None, True],
+}
+
+
+def same(one, other):
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return type(one) is type(other) and all(map(same, one, other)) and len(one) == len(other)
+    return one == other
+
+
+def test_what_is_saved_is_read_back(tmp_path):
+    file = tmp_path / "weights.pt"
+    save_tensors(file, CONTENT)
+    assert same(load_tensors(file), CONTENT)
+    # As anybody reads it.
+    assert same(torch.load(file, weights_only=True), CONTENT)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"]
+
+
+def test_weights_and_numbers_of_other_kinds_are_saved_as_plain_ones(tmp_path):
+    module, file = nn.Linear(2, 3), tmp_path / "weights.pt"
+    save_tensors(file, {"module": module.state_dict(), "number": np.float64(0.1), "size": torch.Size([2])})
+    found = load_tensors(file)
+    assert type(found["module"]) is dict and type(found["number"]) is float and found["size"] == (2,)
+    torch.testing.assert_close(found["module"], dict(module.state_dict()), rtol=0, atol=0)
+
+
+def test_what_could_not_be_read_back_is_not_saved(tmp_path):
+    file = tmp_path / "checkpoint.pt"
+    save_tensors(file, CONTENT)
+    with pytest.raises(ValueError, match=r"\['real_system'\]\['rng'\]\[1\] of what is to be saved is a ndarray"):
+        save_tensors(file, {"real_system": {"rng": [0, np.zeros(2)]}})
+    assert same(load_tensors(file), CONTENT)
+
+
+class Bomb:
+    def __init__(self, file):
+        self.file = file
+
+    def __reduce__(self):
+        return Path.touch, (self.file,)
+
+
+@pytest.mark.parametrize("legacy", [False, True], ids=["zip", "bare pickle"])
+def test_a_file_runs_no_code(tmp_path, legacy):
+    file, trace = tmp_path / "checkpoint.pt", tmp_path / "trace"
+    if legacy:
+        file.write_bytes(pickle.dumps({"format": Bomb(trace)}))
+    else:
+        torch.save({"format": 4, "state": Bomb(trace)}, file)
+    with pytest.raises(ValueError, match="checkpoint.pt is (not loaded|damaged, or no file of a run)"):
+        load_tensors(file)
+    assert not trace.exists()
+
+
+def test_every_truncation_is_noticed(tmp_path):
+    file = tmp_path / "weights.pt"
+    save_tensors(file, CONTENT)
+    whole = file.read_bytes()
+    for length in [*range(0, len(whole), 37), len(whole) - 1]:
+        file.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"weights\.pt is (damaged|not loaded)"):
+            load_tensors(file)
+
+
+def test_a_changed_bit_is_noticed_or_without_effect(tmp_path):
+    file = tmp_path / "weights.pt"
+    save_tensors(file, CONTENT)
+    whole, generator, noticed = file.read_bytes(), np.random.default_rng(0), 0
+    for position in generator.integers(0, len(whole), 1000):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << generator.integers(8)
+        file.write_bytes(bytes(damaged))
+        try:
+            # Bytes between the parts, such as padding and dates, say nothing of the content.
+            assert same(load_tensors(file), CONTENT)
+        except ValueError as error:
+            assert str(file) in str(error)  # noqa: PT017  (most damages raise, a few are without effect)
+            noticed += 1
+    # Half of the file is the one large tensor, whose bits all count.
+    assert noticed > 500
+
+
+def test_torch_reads_no_field_that_python_does_not_check(tmp_path):
+    """The flag that makes a part a folder: torch gives memory of its size that nobody has written."""
+    file = tmp_path / "weights.pt"
+    save_tensors(file, CONTENT)
+    whole = file.read_bytes()
+    flag = whole.index(b"PK\x01\x02") + 38  # external attributes of the first part
+    changed = whole[:flag] + b"\x10" + whole[flag + 1 :]
+    file.write_bytes(changed)
+    with pytest.raises(ValueError, match=r"weights\.pt is damaged.*does not have the checksum"):
+        load_tensors(file)
+    # A file of an earlier version has no checksum of the whole.
+    length = whole.rindex(b"sha256:") - 2
+    file.write_bytes(changed[:length] + b"\0\0")
+    assert same(load_tensors(file), CONTENT)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 100, b"PK\x03\x04", b"{}", os.urandom(5000)])
+def test_a_foreign_file_is_refused_by_name(tmp_path, content):
+    file = tmp_path / "checkpoint.pt"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="checkpoint.pt is damaged, or no file of a run"):
+        load_tensors(file)
+    torch.save([1, 2], file)
+    with pytest.raises(ValueError, match="checkpoint.pt is no file of a run: it holds a list"):
+        load_tensors(file)
+
+
+class Full:
+    """A file on a full disk, which takes only a part of the content."""
+
+    def __init__(self, file):
+        self.file = file
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.file.close()
+
+    def write(self, content):
+        self.file.write(content[:10])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    file = tmp_path / "checkpoint.pt"
+    save_tensors(file, CONTENT)
+    opened = Path.open
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", lambda self, mode="r": Full(opened(self, mode)))
+        with pytest.raises(OSError, match="No space left on device.*intact; make room.*checkpoint.pt"):
+            save_tensors(file, {"other": 1})
+    assert same(load_tensors(file), CONTENT)
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_a_write_into_a_missing_folder_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing is written; make its folder.*gone/metrics\.json") as error:
+        write_json(tmp_path / "gone" / "metrics.json", {})
+    assert "intact" not in str(error.value) and "room" not in str(error.value)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
+def test_a_write_without_permission_says_so(number, tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    (tmp_path / "metrics.json").write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refused)
+        with pytest.raises(
+            OSError, match=r"what was there before is intact; write where you may.*metrics\.json"
+        ) as error:
+            write_json(tmp_path / "metrics.json", {})
+    assert "room" not in str(error.value) and (tmp_path / "metrics.json").read_text() == "old"
+
+
+def test_an_error_after_the_new_content_does_not_speak_of_the_old_one(tmp_path, monkeypatch):
+    """The folder cannot be flushed, so that only a power cut would bring the old content back."""
+    flush = os.fsync
+
+    def failing(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        flush(descriptor)
+
+    file = tmp_path / "metrics.json"
+    file.write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", failing)
+        with pytest.raises(OSError, match=r"is written, but a power cut may undo it.*metrics\.json") as error:
+            write_json(file, {"new": 1})
+    assert "intact" not in str(error.value) and json.loads(file.read_text()) == {"new": 1}
+
+
+def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
+    """The process is killed at the end of the writing, when only the new name is not on the disk yet."""
+    file = tmp_path / "metrics.json"
+    write_json(file, {"old": 1})
+
+    def killed(self, target):
+        assert json.loads(file.read_text()) == {"old": 1}
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(file, b"{")
+    assert json.loads(file.read_text()) == {"old": 1} and len(list(tmp_path.iterdir())) == 1
+
+
+def test_numbers_that_json_does_not_have_are_null(tmp_path):
+    file, found = tmp_path / "metrics.json", {"a": [float("inf"), 1.0], "b": {"c": float("nan"), "d": "NaN"}}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(file, found)
+    assert not list(tmp_path.iterdir())
+    write_json(file, finite(found))
+
+    def refused(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    assert json.loads(file.read_text(), parse_constant=refused) == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}}
+
+
+# Checkpoints: what they hold, what a damaged one does, and a run that has none yet.
+
+
+QUICK = {"figures": False, "untrained": 0}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A run of two episodes."""
+    path = tmp_path_factory.mktemp("run")
+    small_run(path, episodes=2, **QUICK).train()
+    return path
+
+
+def test_a_checkpoint_holds_tensors_in_plain_containers(folder):
+    found = torch.load(folder / "checkpoint.pt", weights_only=True)
+    assert plain(found).keys() == {"format", "episodes", "state"} and len(found["episodes"]) == 2
+    assert (
+        found["state"]["algorithm"]["learner"]["memory"]["count"] == 40
+    )  # two episodes of 20 transitions, none of the 460 free places
+
+
+def test_the_memory_samples_the_same_after_it_was_restored(folder, tmp_path):
+    runs = [small_run(tmp_path / name, episodes=2, **QUICK) for name in ("one", "other")]
+    for run in runs:
+        checkpoint.load(folder / "checkpoint.pt", run.algorithm)
+    one, other = (run.algorithm.learner.memory for run in runs)
+    assert len(one) == len(other) == 40
+    for _ in range(3):
+        batches = [memory.sample(16) for memory in (one, other)]
+        for key in batches[0].keys(True, True):
+            assert torch.equal(batches[0][key], batches[1][key])
+        for memory, batch in zip((one, other), batches, strict=True):
+            memory.refresh(batch["index"], batch["next", "reward"].squeeze(-1))
+
+
+def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_path):
+    whole, generator = (folder / "checkpoint.pt").read_bytes(), np.random.default_rng(1)
+    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
+    before = (tmp_path / "config.json").read_bytes()
+    for length in generator.integers(0, len(whole), 5):
+        (tmp_path / "checkpoint.pt").write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged.*train anew in this folder, use --overwrite"):
+            small_run(tmp_path, resume=True, **QUICK)
+    middle = bytearray(whole)
+    middle[whole.index(b"PK\x03\x04", len(whole) // 2) - 100] ^= 1  # within a tensor: parts follow each other
+    (tmp_path / "checkpoint.pt").write_bytes(bytes(middle))
+    with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
+        small_run(tmp_path, resume=True, **QUICK)
+    assert (tmp_path / "config.json").read_bytes() == before
+
+
+def stale(_):
+    raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))  # as a read in an open file does, without a name
+
+
+def without_memory(_):
+    raise MemoryError
+
+
+def without_memory_for_a_tensor(*_, **__):
+    torch.empty(2**57)
+
+
+@pytest.mark.parametrize(
+    ("where", "failing", "said"),
+    [
+        ((Path, "read_bytes"), stale, os.strerror(errno.ESTALE)),
+        ((Path, "read_bytes"), without_memory, os.strerror(errno.ENOMEM)),
+        ((torch, "load"), without_memory_for_a_tensor, os.strerror(errno.ENOMEM)),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
+    where, failing, said, folder, tmp_path, monkeypatch
+):
+    """The earlier checkpoint would be sound: a training that took it would fly an episode again."""
+    algorithm = small_run(tmp_path / "run", **QUICK).algorithm
+    for name in ("checkpoint.pt", "checkpoint-0001.pt"):
+        (tmp_path / name).write_bytes((folder / "checkpoint.pt").read_bytes())
+    with monkeypatch.context() as patched:
+        patched.setattr(*where, failing)
+        with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint\.pt"):
+            checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
+    assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint.pt"]
+    assert len(checkpoint.load(tmp_path / "checkpoint.pt", algorithm)) == 2
+
+
+@pytest.mark.parametrize("part", ["policies", "learner", "short_term", "virtual", "referee", "env"])
+def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, part):
+    found = load_tensors(folder / "checkpoint.pt")
+    del found["state"]["algorithm"][part]
+    save_tensors(tmp_path / "checkpoint.pt", found)
+    algorithm = small_run(tmp_path / "run", **QUICK).algorithm
+    with pytest.raises(ValueError, match=f"weights do not fit this training.*{part}"):
+        checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
+
+
+def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
+    save_tensors(tmp_path / "checkpoint.pt", load_tensors(folder / "checkpoint.pt") | {"format": 2})
+    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 4"):
+        checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
+
+
+def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
+    """The plant's arguments are not options of the run, so only the weights show them."""
+    small_run(tmp_path, episodes=1, model_free_policy="mlp", hidden=(4,), **QUICK).train()
+    config = json.loads((tmp_path / "config.json").read_text())
+
+    class Observant(LinearQuadratic):
+        observations = (*LinearQuadratic.observations, Signal(symbol="e", name="again", unit="m"))
+
+        def observe(self, t, state, exogenous):
+            return torch.cat([state, state[..., :1]], -1)
+
+        def make_policy(self, generator):
+            policy = super().make_policy(generator)
+            policy.gain = torch.nn.Parameter(torch.zeros(1, 3, dtype=torch.float64))
+            return policy
+
+    options = {"compiled": False, "unseen": 3, "twinning": SMALL, "model_free_policy": "mlp", "hidden": (4,)}
+    with pytest.raises(ValueError, match="weights do not fit"):
+        Run(RunConfig(log_dir=tmp_path, resume=True, **options), Observant(horizon=2.0))
+    assert json.loads((tmp_path / "config.json").read_text()) == config
+
+
+def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
+    def killed(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ReinforcementTwinning, "plan", killed)
+        with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
+            small_run(tmp_path, episodes=1, **QUICK).train()
+    with pytest.raises(ValueError, match="holds a run already.*--resume it, or --overwrite it"):
+        small_run(tmp_path, episodes=1, **QUICK)
+    resumed = small_run(tmp_path, episodes=1, resume=True, **QUICK).train()
+    assert "has no episode done yet: it starts from its beginning" in capsys.readouterr().out
+    whole = small_run(tmp_path / "whole", episodes=1, **QUICK).train()
+    for record in (*resumed["episodes"], *whole["episodes"]):
+        record["seconds"] = None
+    assert resumed["episodes"] == whole["episodes"]
+
+
+def test_a_run_with_a_second_training_in_its_folder_is_refused(tmp_path):
+    first = small_run(tmp_path, episodes=1, **QUICK)
+    assert first.folder == tmp_path
+    with pytest.raises(ValueError, match="is in use by another training"):
+        small_run(tmp_path, episodes=1, overwrite=True, **QUICK)

@@ -1,21 +1,31 @@
-"""A plant behind OPC UA and Modbus: the served plant, the client's environment, and both protocols between them."""
+"""A plant behind OPC UA and Modbus, lost connections, and the recipes and the page that connect to one."""
 
+import json
 import math
 import socket
+import threading
+import time
 
 import pytest
 import torch
+from fault_counts import count
 from linear_quadratic import LinearQuadratic
+from printed_commands import blocks
 from served_plants import free_port, served
 from tensordict import TensorDict
+from test_export_recipe import leave_run, recipe
 
+from rt_torchrl.export.program import export_program
+from rt_torchrl.runs.configured_plant import physics_of
 from rt_torchrl.systems.protocols.connected_plant import ConnectedPlant
 from rt_torchrl.systems.protocols.link import LinkLostError
 from rt_torchrl.systems.protocols.modbus import ModbusLink
+from rt_torchrl.systems.protocols.relay import Relay
 from rt_torchrl.systems.protocols.served_plant import ServedPlant
 from rt_torchrl.systems.protocols.served_system import link_to, served_system
 from rt_torchrl.systems.protocols.server_process import ServerProcess
 from rt_torchrl.systems.protocols.tags import ANSWERED, SAMPLE, Tags
+from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.rollout import Rollout
 
 PLANT = LinearQuadratic(horizon=2.0)
@@ -236,3 +246,257 @@ def test_a_port_in_use_is_said_without_a_traceback(protocol, capfd):
         with pytest.raises(ValueError, match=f"port={port}"):
             ServerProcess(LinearQuadratic(), (0.0,), protocol=protocol, port=port, period=0.1).__enter__()
     assert "Traceback" not in capfd.readouterr().err
+
+
+# Lost connections between a client and a served plant: cut off, and silent as with a cable that was pulled.
+
+
+ENDLESS = LinearQuadratic(horizon=1e3)
+PERIOD = 0.05
+SAFE, ASKED = -0.5, 1.0
+
+
+class Course:
+    """What the plant has applied, sample by sample, and when; written by the plant's own thread."""
+
+    def __init__(self, running):
+        self.applied, self.times = [], []
+        advance = running.advance
+
+        def watched(answered, command):
+            advance(answered, command)
+            self.applied.append(running.published()["applied.force"])
+            self.times.append(time.monotonic())
+
+        running.advance = watched
+
+
+def acting(system, row, steps):
+    for _ in range(steps):
+        row = system.step(row.set("action", torch.tensor([[ASKED]]).double()))
+        row = system.step_mdp(row)
+    return row
+
+
+def lost_connections(protocol, losses, seed):
+    """The course of a plant whose connection is lost a number of times, and the times of the losses."""
+    generator = torch.Generator().manual_seed(seed)
+    with served(ENDLESS, protocol, safe=(SAFE,), period=PERIOD) as (running, port):
+        relay, course, moments = Relay(port), Course(running), []
+        system = served_system(ENDLESS, safe=(SAFE,), protocol=protocol, port=relay.port, period=PERIOD)
+        row = acting(system, system.reset(), 10)
+        for k in range(losses):
+            seconds = PERIOD * (2.0 + 4.0 * torch.rand((), generator=generator).item())
+            moments.append(time.monotonic())
+            (relay.cut if k % 2 else relay.stall)(seconds)
+            row = acting(system, row, 8)
+            for _ in range(100):  # until the plant follows again
+                if not running.safe and not row["refused"].any():
+                    break
+                row = acting(system, row, 1)
+            assert not running.safe, f"the run does not go on after loss {k}"
+            row = acting(system, row, 2)
+        env = system.env.env
+        found = env.losses + env.late
+        system.close()
+        relay.close()
+    return course, moments, found
+
+
+def check(course, moments):
+    """Every loss brings the safe action within one period of the first command that stays out."""
+    for moment, following in zip(moments, [*moments[1:], course.times[-1]], strict=True):
+        inside = [k for k, at in enumerate(course.times) if moment <= at < following]
+        safe = [k for k in inside if course.applied[k] == SAFE]
+        assert safe, "the loss has not brought the safe action"
+        # The interval under way may be answered already. The next one runs under the safe action, and is noted at its
+        # end: two periods, and half of one for a server that shares its core with the test.
+        assert course.times[safe[0]] - moment <= 2.5 * PERIOD
+        assert {course.applied[k] for k in inside} <= {SAFE, ASKED}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["modbus", pytest.param("opcua", marks=pytest.mark.nightly)])
+def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol):
+    course, moments, noticed = lost_connections(protocol, 2, 0)
+    check(course, moments)
+    assert noticed >= 2
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("protocol", ["opcua", "modbus"])
+def test_thirty_lost_connections_bring_the_safe_action_and_the_run_goes_on(protocol):
+    what, losses = f"lost connections, {protocol}", 30
+    try:
+        course, moments, noticed = lost_connections(protocol, losses, 1)
+        check(course, moments)
+        assert noticed >= losses  # a short silence is a late answer or two, and no lost connection
+    except BaseException:
+        count(what, "failed", defect=True)
+        raise
+    for _ in moments:
+        count(what, "safe action in time, the run went on")
+
+
+class Brittle:
+    """A link on which the first writes after each of some connections fail."""
+
+    def __init__(self, failures):
+        self.failures, self.connections, self.sample = failures, 0, 0.0
+
+    def connect(self):
+        self.connections += 1
+
+    def read(self):
+        self.sample += 1.0
+        return {"speed": 1.0, "sample": self.sample}
+
+    def write(self, values):
+        if self.connections <= self.failures:
+            raise LinkLostError("cut")
+
+    def close(self):
+        pass
+
+
+class Slow(ConnectedPlant):
+    """A client whose mender takes a while from its new connection to its end."""
+
+    @property
+    def _connected(self):
+        return self.__dict__.get("up", False)
+
+    @_connected.setter
+    def _connected(self, value):
+        self.__dict__["up"] = value
+        if value and threading.current_thread() is not threading.main_thread():
+            time.sleep(0.1)
+
+
+def test_a_loss_right_after_a_new_connection_is_mended_too():
+    link = Brittle(failures=2)
+    env = Slow(link, {"state": ("speed",)}, ("force",), ENDLESS.actions, period=0.01, sample="sample")
+    row = env.reset()
+    for _ in range(100):
+        row = env.step(row.set("action", torch.tensor([ASKED]).double()))["next"]
+        if link.connections > 2 and row["state"].isfinite().all():
+            break
+    assert row["state"].tolist() == [1.0] and (link.connections, env.losses) == (3, 2)
+    env.close()
+
+
+# The recipes around the served turbine, in small: they end, and their results say what happened.
+
+
+PACE = 5.0  # a period of 0.1 s, for a machine that does other things too
+
+
+@pytest.mark.nightly
+def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
+    module = recipe("served_turbine")
+    usual = module.Config().defaults()
+    config = module.dataclasses.replace(
+        usual, quick=True, horizon=60.0, pace=PACE, port=free_port(), threads=1, log_dir=tmp_path, figures=False
+    )
+    module.main(module.dataclasses.replace(config, untrained=0))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    versions = [record["version"] for record in metrics["episodes"]]
+    assert len(versions) == 3 and versions == sorted(versions) and versions[-1] >= 1.0
+    assert all(0.0 < record["late_median"] < 100.0 for record in metrics["episodes"])
+
+
+@pytest.mark.nightly
+def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
+    config, parts = leave_run(tmp_path / "run", "wind_turbine")
+    export_program(parts["model_based"], tmp_path / "law.pt2", physics_of(config))
+    module = recipe("in_service")
+    module.main(
+        module.Config(
+            policy=tmp_path / "law.pt2",
+            trusted=True,
+            port=free_port(),
+            pace=PACE,
+            seconds=20.0,
+            log_dir=tmp_path / "found",
+        )
+    )
+    found = json.loads((tmp_path / "found" / "in_service.json").read_text())
+    assert found["intervals"] == 40.0 and found["lost_connections"] == 0.0 and found["J_a"] > 0.0
+
+
+@pytest.mark.nightly
+def test_a_short_soak_counts_its_faults_and_handles(tmp_path):
+    module = recipe("soak")
+    options = {"hours": 0.02, "faults": 10.0, "pace": PACE, "horizon": 30.0, "port": free_port()}
+    module.main(module.Config(log_dir=tmp_path, **options))
+    found = json.loads((tmp_path / "soak.json").read_text())
+    assert found["faults"] and found["safety_events"] > 0
+    assert len(found["faults"]) - 1 <= found["faults_logged"] <= len(found["faults"])  # the last may outlive the run
+    for process in ("learner", "acting", "server", "relay"):
+        assert found["processes"][process]["handles_last"] <= found["processes"][process]["handles_first"] + 2
+
+
+@pytest.mark.nightly
+def test_jitter_is_measured_with_and_without_learning(tmp_path):
+    module = recipe("jitter")
+    module.main(module.Config(seconds=5.0, turns=1, log_dir=tmp_path))
+    found = json.loads((tmp_path / "jitter.json").read_text())
+    for kind in ("idle", "learning"):
+        assert found[kind]["intervals"] >= 100.0
+        assert 0.0 <= found[kind]["median_ms"] <= found[kind]["p99_ms"] <= found[kind]["max_ms"]
+    assert found["learner_ratio"] > 0.0
+
+
+@pytest.mark.nightly
+def test_trainings_of_the_same_real_time_are_compared(tmp_path):
+    module = recipe("asynchronous")
+    options = {"hours": 0.05, "horizon": 60.0, "seeds": (0,), "quick": True, "pace": 10.0}
+    module.main(module.Config(log_dir=tmp_path, **options))
+    (found,) = json.loads((tmp_path / "asynchronous.json").read_text())["seeds"]
+    assert found["synchronous"] > 0.0 and found["asynchronous"] > 0.0 and found["learning_share"] > 0.0
+
+
+def test_costs_are_summed_over_the_real_time_alone():
+    """Two hours: an hour and a half of episodes, half an hour of waiting between, and what comes later is left out."""
+    module = recipe("asynchronous")
+    config = module.Config(hours=2.0, horizon=1800.0)
+    found = module.course([1.0, 2.0, 3.0, 9.0], [1.0] * 4, [1800.0, 0.0, 0.0, 0.0], 5.0, config)
+    assert found == 1800.0 * (1.0 + 5.0 + 2.0 + 3.0) / 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value"),
+    [
+        ("served_turbine", "pace", 0.0),
+        ("served_turbine", "port", 0),
+        ("soak", "hours", 0.0),
+        ("soak", "faults", -1.0),
+        ("jitter", "period", 0.0),
+        ("jitter", "turns", 0),
+        ("asynchronous", "pace", -1.0),
+        ("asynchronous", "hours", 0.1),
+        ("asynchronous", "seeds", ()),
+    ],
+)
+def test_impossible_options_are_refused(name, option, value):
+    with pytest.raises(ValueError, match=f"{option}="):
+        recipe(name).Config(**{option: value})
+
+
+# What the page "Connect your machine" prints: its example makes a real system that has not connected yet.
+
+
+def test_the_example_makes_a_real_system_that_connects_at_its_reset():
+    pytest.importorskip("asyncua")
+    (code,) = blocks("connect_your_machine.md", "python")
+    names = {}
+    exec(code.replace("opc.tcp://rig:4840", f"opc.tcp://127.0.0.1:{free_port()}"), names)  # nobody listens there
+    system = names["machine"]()
+    assert isinstance(system, RealSystem) and system.pace.period == system.plant.dt == 0.05
+    client = system.env.env
+    assert client.losses == 0
+    with pytest.raises(LinkLostError):
+        client.link.read()
+    low, high = system.env.limits.low, system.env.limits.high
+    assert torch.equal(low, -high)
+    client.link.close()

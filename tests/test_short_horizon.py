@@ -10,7 +10,8 @@ from seeds_and_numbers import seeded
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.steps.config import PlannerConfig, ShortHorizonConfig
-from rt_torchrl.steps.plan import ShortHorizon, make_planner
+from rt_torchrl.steps.plan import make_planner
+from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
