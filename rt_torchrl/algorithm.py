@@ -234,8 +234,10 @@ class ReinforcementTwinning(TensorDictSequential):
         """Let an episode flow through the steps, after the start before the first one; see :meth:`episode`."""
         if "live" not in episode:
             episode.set_non_tensor("live", self.referee.live)
-        begins = {"start": self.start} if self.first is not None and not self.episodes_done else {}
-        for name, step in {**begins, **self.module}.items():
+        steps: dict[str, Callable[[TensorDictBase], TensorDictBase]] = dict(self.module.items())
+        if self.first is not None and not self.episodes_done:
+            steps = {"start": self.start} | steps
+        for name, step in steps.items():
             safe_point()
             tell(name)
             start = time.perf_counter()

@@ -435,14 +435,14 @@ class SensorAssimilation(Assimilation):
             held.copy_(value)
         return estimation.fit_initial_states(records, noise).normal_equations()
 
-    def report(self) -> dict[str, float]:
+    def report(self) -> Mapping[str, float | str]:
         """RMS and standard errors, noise levels and biases of the last update, by name."""
         if self.estimate is None:
             return {}
         errors = self.standard_errors(self._records)
         found = {f"noise/{name}": value for name, value in self.estimate.noise.items()}
         found |= {f"bias/{name}": self.estimate.biases[name] for name in self.config.biased}
-        return found | {f"standard_error/{name}": value for name, value in errors.items()} | super().report()
+        return {**found, **{f"standard_error/{name}": value for name, value in errors.items()}, **super().report()}
 
     def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
         """RMS error of what every sensor reads, in the records of the last update."""

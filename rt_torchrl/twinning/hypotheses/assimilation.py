@@ -134,7 +134,7 @@ class EnsembleAssimilation(Assimilation):
             found["J_p_before"] = self._before
         if self.ensemble.hypothesis is not None and self._records:
             found |= {"J_p": self._believed_cost(self._records), "believed": self.ensemble.hypothesis}
-        return found | super().report()
+        return {**found, **super().report()}
 
     def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
         """RMS errors of the likeliest hypothesis; see :meth:`Assimilation.rms_errors`."""
