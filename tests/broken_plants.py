@@ -304,7 +304,7 @@ BROKEN = {
     PartlyDetached: "running_cost: its derivative by state 'position' is .*by finite differences",
     InfiniteSlope: "running_cost: its derivative by state 'position' is not finite",
     UnusedWeight: "vector_field: closure weight 'forgotten' changes it at none",
-    ReverseOnly: "step: torch.func.jvp under vmap fails",
+    ReverseOnly: r"latch: raised RuntimeError in .*broken_plants\.py, line .*autograd.Function.*forward and reverse",
     Stiff: r"dt: 0.1 s is too long for the eigenvalue -39.* 1/s .*Use dt <= 0.0\d+ s",
     Explosive: "step: plant 'linear_quadratic' diverged in realisation",
     Raising: "running_cost: raised KeyError in .*broken_plants.py",

@@ -204,6 +204,17 @@ def test_a_change_is_followed_or_the_thing_is_refused_by_name(kind, monkeypatch)
         assert not refusals
 
 
+def test_what_no_code_reads_of_a_class_may_change(monkeypatch):
+    """Such as a number of instances."""
+    made, plant = counted(monkeypatch), changes.with_attributes(instances=0)
+    for count in range(3):
+        type(plant).instances = count
+        cost(plant, "native", {})
+    assert len(made) == 1
+    type(plant).running_cost = lambda self, t, state, applied, exogenous: 0.0 * state[..., 0]
+    assert cost(plant, "native", {}) == cost(plant, "autograd", {}) and len(made) == 2
+
+
 # What is no function of its arguments is refused in words, by every engine and on every path that flies it
 
 

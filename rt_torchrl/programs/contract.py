@@ -28,7 +28,7 @@ from collections.abc import Iterable, Iterator, Mapping, MutableSequence, Mutabl
 from contextlib import contextmanager
 from functools import lru_cache
 from itertools import chain
-from operator import methodcaller
+from operator import getitem, methodcaller
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,7 +97,9 @@ class Compared:
 
     def __init__(self) -> None:
         self.mappings, self.sequences, self.instances = list[Any](), list[Any](), list[Any]()
-        self.entries, self.parts = list[tuple[dict[str, Any], str]](), list[tuple[Any, str]]()
+        self.entries, self.parts = list[tuple[Mapping[str, Any], str]](), list[tuple[Any, str]]()
+        self.classes = list[Mapping[str, Any]]()
+        """Attributes of classes, of which none may come or go."""
         self.tensors, self.constants = list[Tensor](), list[Any]()
         """Tensors in their memory, and tensors and arrays with their numbers."""
 
@@ -113,11 +115,11 @@ class Compared:
         """All objects; as long as the array lives, no other object takes their addresses."""
         containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
         kinds, dicts = map(type, self.instances), map(vars, self.instances)
-        others = chain(kinds, dicts, map(dict.get, *self._entries), map(getattr, *self._parts))
+        others = chain(kinds, dicts, map(getitem, *self._entries), map(getattr, *self._parts))
         return np.fromiter(chain(chain.from_iterable(containers), others), object, count)
 
     def _numbers(self) -> list[object]:
-        sizes = map(len, chain(self.mappings, self.sequences))
+        sizes = map(len, chain(self.mappings, self.sequences, self.classes))
         return [*sizes, *(x.requires_grad for x in self.tensors), *map(_bytes, self.constants)]
 
     def same(self) -> bool:
@@ -128,7 +130,7 @@ class Compared:
                 and all(map(Tensor.is_set_to, self.tensors, self._views))
                 and self._objects(len(self._then)).tobytes() == self._addresses
             )
-        except (AttributeError, ValueError, RuntimeError):  # a value is lost, or a tensor has another type
+        except (AttributeError, KeyError, ValueError, RuntimeError):  # a value is lost, or a tensor's type is another
             return False
 
 
@@ -244,7 +246,7 @@ def _bytes(x: Any) -> bytes:
 
 
 class Outside(Compared):
-    """Constants outside of a module, which can only be replaced, and classes."""
+    """Constants outside of a module, which can only be replaced, and classes with their methods."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -252,11 +254,13 @@ class Outside(Compared):
         self.note()
 
     def add_class(self, kind: type) -> bool:
-        """Let the bases and all attributes of a class stay the same; whether the class is a new one."""
+        """Let the bases and methods of a class stay the same; whether the class is a new one."""
         new = kind not in self._kinds
         if new:
             self._kinds.add(kind)
-            self.sequences.append(vars(kind).values())
+            held = vars(kind)
+            self.classes.append(held)
+            self.entries += [(held, name) for name, value in held.items() if isinstance(value, WRAPPERS)]
             self.parts.append((kind, "__mro__"))
         return new
 
@@ -339,7 +343,8 @@ class _Reads:
 
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
-        value, attributes = (holder if isinstance(holder, dict) else vars(holder))[name], _names(code).attributes
+        there, attributes = holder if isinstance(holder, dict) else vars(holder), _names(code).attributes
+        value = there[name]
         if value is os.environ or value is os.getenv or (value is os and attributes & {*ENVIRONMENT}):
             raise _refusal(code, "the environment (os.environ)")
         if isinstance(value, types.ModuleType) and foreign(value.__name__):
@@ -353,8 +358,7 @@ class _Reads:
             self._note_function(value)
             if isinstance(holder, type):
                 self.outside.add_class(holder)
-            else:
-                self.outside.entries.append((holder if isinstance(holder, dict) else vars(holder), name))
+            self.outside.entries.append((there, name))
             self.outside.constants += [value] if followed else []
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
