@@ -188,7 +188,7 @@ def test_wrong_arguments_are_refused(request_, message, unchecked):
 
 
 def test_tensors_that_come_again_are_read_anew(unchecked):
-    """A rollout holds no numbers of its last call."""
+    """A rollout holds the drive of its last call, but no numbers of it."""
     plant = LinearQuadratic(horizon=1.0)
     (state, exogenous, command), closure = drawn(plant, 3), LinearClosure(torch.zeros(2, 2))
     native, exact = (Rollout(plant, closure, engine=engine) for engine in ("native", "autograd"))
