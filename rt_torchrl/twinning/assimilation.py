@@ -381,10 +381,11 @@ class Assimilation:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return self._progress() | {"first": self.first}
+        return self._progress() | {"first": self.first, "length": self.length}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._resume(state)
+        self.length = state["length"]
         closure = self.twin.closure
         present = copy.deepcopy(closure.state_dict())
         closure.load_state_dict(state["first"])
