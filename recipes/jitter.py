@@ -94,7 +94,7 @@ def turn(operation, learner: Learner | None, seconds: float) -> tuple[np.ndarray
     while time.monotonic() < end:
         if learner is not None:
             rounds.append(learner.learn())
-            operation.hand_over(NAME, learner.policies[NAME], strength=0.0, episode=0)
+            operation.hand_over(NAME, learner.policies[NAME], strength=0.0)
             while operation.waiting():
                 late.append(operation.rollout()["late"].flatten().numpy())
         else:
@@ -119,7 +119,7 @@ def statistics(late: list[np.ndarray], period: float) -> dict[str, float]:
 def measure(operation, learner: Learner, config: Config) -> tuple[dict[str, dict[str, float]], list[float]]:
     """Lateness without and with learning beside it, in turn, and the times of the learner's rounds [s]."""
     late, rounds = {"idle": [], "learning": []}, []
-    operation.hand_over(NAME, learner.policies[NAME], strength=0.0, episode=0)
+    operation.hand_over(NAME, learner.policies[NAME], strength=0.0)
     for k in range(config.turns):
         for kind, beside in (("idle", None), ("learning", learner)):
             found, times = turn(operation, beside, config.seconds)
