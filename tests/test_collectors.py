@@ -3,6 +3,8 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
 
 from rt_torchrl import shipped_plants
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
@@ -48,6 +50,26 @@ def compare(make, strengths=(1.0, 0.0), **tolerance):
             torch.testing.assert_close(one[key], other[key], msg=lambda text, key=key: f"{key}: {text}", **tolerance)
     for key, value in reference.state_dict().items():  # the same draws were made
         assert torch.equal(torch.as_tensor(env.state_dict()[key]), torch.as_tensor(value)), key
+
+
+@pytest.mark.parametrize("kind", [FlightCollector, stepped])
+def test_an_episode_is_that_of_torchrls_own_collector(kind):
+    plant, flown = LinearQuadratic(horizon=2.0), []
+
+    def torchrls(env, actor):
+        env.pass_over()
+        module = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
+        return Collector(env, module, frames_per_batch=plant.n_steps, total_frames=plant.n_steps)
+
+    for make in (kind, torchrls):
+        env, actor, policy = system(plant)
+        collector = make(env, actor)
+        actor.begin(policy, strength=1.0)
+        actor.generator.manual_seed(2)  # TorchRL tries the policy before the first episode
+        flown.append(next(iter(collector)))
+    one, other = flown
+    for key in one.keys(True, True):
+        torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-13, msg=str(key))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])

@@ -54,7 +54,7 @@ def update_by_torchrl(learner: ActorCritic) -> None:
         iteration = Iteration(learner, kind, keys)
         results = dict(zip(iteration.names, iteration.eager(*(batch[key] for key in keys)), strict=True))
         if "errors" in results:
-            buffer.update_tensordict_priority(batch.set("td_error", results["errors"]))
+            buffer.update_tensordict_priority(batch.set("td_error", results["errors"].float()))
 
 
 def _learner(plant: str, algorithm: str, iterations: int) -> ActorCritic:

@@ -1,5 +1,12 @@
-"""Collectors fly whole real episodes, one at a time: by steps or, in simulation, by machine code."""
+"""TorchRL collectors of whole real episodes, one at a time: by steps or, in simulation, by machine code.
 
+TorchRL's own ``Collector`` resets the system as soon as an episode is over, and loses what was flown where the system
+fails. A machine begins an episode when the algorithm asks for it, and what it flew before a fault is learned from. The
+data are the same.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterator
 from typing import cast
 
 import torch
@@ -7,6 +14,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant, with_memories
@@ -66,7 +74,7 @@ class ExploringController(RememberingInterval, ExploringInterval):
         return (command + noise).clamp(self.low, self.high), memory
 
 
-class EpisodeCollector:
+class EpisodeCollector(BaseCollector):
     """A collector that steps the system: each episode begins with one reset, however the last episode ended.
 
     Args:
@@ -76,8 +84,26 @@ class EpisodeCollector:
     """
 
     def __init__(self, env: EnvBase, actor: LivePolicy, plant: Plant):
-        self.env, self._plant, self._live = env, plant, actor
-        self._actor = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
+        super().__init__()
+        self.env, self.actor, self._plant = env, actor, plant
+        self._acting = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Fly one episode after another."""
+        while True:
+            yield self.rollout()
+
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        """Leave the system as it is: it belongs to who made it."""
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        return cast(int, self.env.set_seed(seed, static_seed=static_seed))
+
+    def state_dict(self) -> OrderedDict[str, Tensor]:
+        return OrderedDict(self.env.state_dict())
+
+    def load_state_dict(self, state_dict: OrderedDict[str, Tensor]) -> None:
+        self.env.load_state_dict(state_dict)
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
@@ -98,10 +124,10 @@ class EpisodeCollector:
             raise
         except Exception as error:  # whatever a machine, its driver or its connection may raise
             raise EpisodeEndedError(failure(error, plant), None) from error
-        if not isinstance(self._live.policy, StateFeedback):
-            require_pure_policy(self._live.policy, now["observation"])
+        if not isinstance(self.actor.policy, StateFeedback):
+            require_pure_policy(self.actor.policy, now["observation"])
         for k in range(plant.n_steps):
-            asked = self._actor(now)
+            asked = self._acting(now)
             try:
                 stepped = self.env.step(asked)
             except DivergenceError:
@@ -140,7 +166,7 @@ def failure(error: Exception, plant: Plant, interval: int | None = None) -> str:
     return f"the system failed {where}: {said}"
 
 
-class FlightCollector:
+class FlightCollector(EpisodeCollector):
     """A collector for a :class:`PlantEnv`: the entries and draws of :class:`EpisodeCollector` by machine code.
 
     No interval takes a Python step. A step of an environment costs some 0.4 ms, and an interval of the engine
@@ -154,18 +180,16 @@ class FlightCollector:
     """
 
     def __init__(self, env: PlantEnv, actor: LivePolicy):
-        self.env, self.actor = env, actor
+        super().__init__(env, actor, env.plant)
         self._engine = Native(compiled=env.compiled)
-        self._by_steps = EpisodeCollector(env, actor, env.plant)
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
         """Fly one episode; its TensorDict has the batch size ``batch n``."""
-        env = self.env
-        policy = self.actor.policy
+        env, policy = cast(PlantEnv, self.env), self.actor.policy
         law = policy if isinstance(policy, Remembering) else None
         if isinstance(policy, StateFeedback) and law is None:
-            return self._by_steps.rollout()
+            return super().rollout()
         pass_over(env)
         env.reset()
         closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn
