@@ -197,8 +197,9 @@ class ScaledPolicy(nn.Module):
         return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
 
 
-TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
 Key = str | tuple[str, ...]
+NEXT: tuple[Key, ...] = tuple(("next", key) for key in ("observation", "reward", "done", "terminated"))
+TRANSITION: tuple[Key, ...] = ("observation", "action", *NEXT)
 BATCH: tuple[Key, ...] = (*TRANSITION, "priority_weight", "steps_to_next_obs")
 """What a loss reads of a batch, where it is there."""
 AT_ONCE = 50
@@ -460,7 +461,8 @@ class Adam:
         adam(
             cast(list[Tensor], self.weights),
             gradients,
-            *self.moments,
+            self.moments[0],
+            self.moments[1],
             max_exp_avg_sqs=[],
             state_steps=self.steps,
             fused=True,
@@ -592,10 +594,12 @@ def flat(module: GraphModule) -> Callable[..., Sequence[Tensor]]:
     """
     graph, held = module.graph, dict[str, Tensor]()
     for node in graph.nodes:
-        (source, *_) = node.all_input_nodes or (None,)
         if node.op == "get_attr":
             held[node.target] = getattr(module, node.target).detach()
-        elif node.target in PASSED:
+        if not node.all_input_nodes:
+            continue
+        source = node.all_input_nodes[0]
+        if node.target in PASSED:
             node.replace_all_uses_with(source)
         elif node.target is aten.t.default and source.op == "get_attr":
             name = f"{source.target}_t"

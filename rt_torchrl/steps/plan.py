@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended, Descent, stuck
 from rt_torchrl.optimisers.limited_mean import limited_mean
-from rt_torchrl.steps.belief import Belief, Judged
+from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
@@ -275,7 +275,9 @@ class MultiStart:
         several = self._several(episode, best)
         flown = self.belief.best_flown(policy, judged_on) if several or self._refuted else None
         if several:
-            best = self._best(best, self._others(episode, planned_on, flown), planned_on, judged_on)
+            others = self._others(episode, planned_on, flown)
+            new = (weights for weights in others if not equal(weights, present))
+            best = self._best(best, new, planned_on, judged_on)
         if flown is not None and self._refuted and flown[1] < best.cost:
             best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
