@@ -20,11 +20,11 @@ from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, Trajectory, c
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.tensor_file import load_tensors
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.flight import ShortTermMemory
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.trajectories.trajectory import batch_of
-from rt_torchrl.twinning.assimilation import Assimilation
-from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 
 EPISODES = {"wind_turbine": 3, "flapping_wing": 2, "cryogenic_tank": 3}
 """Number of real episodes, of which the first one is flown by the classical controller."""

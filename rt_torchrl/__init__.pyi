@@ -56,15 +56,21 @@ from .fit.uncertainty import Uncertainty
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
-from .twinning.assimilation import AssimilationConfig
-from .twinning.hypotheses.config import HypothesesConfig
-from .twinning.hypotheses.ensemble import TwinEnsemble
-from .twinning.config import TwinningConfig
-from .steps.config import ConstraintsConfig, ExogenousConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
+from .steps.config import (
+    AssimilationConfig,
+    ConstraintsConfig,
+    ExogenousConfig,
+    HypothesesConfig,
+    PlannerConfig,
+    RefereeConfig,
+    ShortHorizonConfig,
+    TwinningConfig,
+)
+from .steps.hypotheses.ensemble import TwinEnsemble
 from .steps.plan import Planner, RecedingHorizonPlanner, WholeEpisodes
 from .steps.short_horizon import ShortHorizon
 from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
-from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
+from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
 from .interruption import require_finished

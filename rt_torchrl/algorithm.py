@@ -36,12 +36,14 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.steps.assimilate import Assimilate
+from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import Role, TwinningConfig
+from rt_torchrl.steps.flight import RealFlights, ShortTermMemory
+from rt_torchrl.steps.hypotheses.choice import make_assimilation
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
-from rt_torchrl.steps.interact import Interact
+from rt_torchrl.steps.interact import Clearance, Interact, Operating
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, findings, merged, on_device
@@ -54,13 +56,6 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation
-from rt_torchrl.twinning.clearance import Clearance
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.flight import RealFlights
-from rt_torchrl.twinning.hypotheses.choice import make_assimilation
-from rt_torchrl.twinning.operating import Operating
-from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 
 ARMS = {
     "twinning": ("interact", "learn", "inputs", "assimilate", "plan", "switch"),

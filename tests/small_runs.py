@@ -4,10 +4,8 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig, RefereeConfig
+from rt_torchrl.steps.config import HypothesesConfig, LearnerConfig, LongTermMemoryConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
 SMALL = TwinningConfig(
     hypotheses=HypothesesConfig(which="none"),  # a twin that has hardly learned would call for them

@@ -12,12 +12,10 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 

@@ -15,13 +15,13 @@ from rt_torchrl.fit.least_squares import Estimation
 from rt_torchrl.fit.sensors import sensor_record, sensors_of, state_sensors
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.steps.assimilate import Assimilation, FirstStates, SensorAssimilation
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin, Sensitivities
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, FirstStates, SensorAssimilation
-from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
 WINDS = (1.0, -2.0)
 

@@ -18,7 +18,8 @@ from rt_torchrl.runs.settings import config_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})

@@ -118,7 +118,7 @@ def test_a_printed_training_begins(command, clone, monkeypatch):
     """Up to its first real episode; the tests of the algorithm train on."""
     if "rosco" in command:
         pytest.importorskip("rosco")
-    first = "rt_torchrl.twinning.algorithm.ReinforcementTwinning.episode"
+    first = "rt_torchrl.algorithm.ReinforcementTwinning.episode"
     folder = re.search(r"(runs/wind_turbine/TIME-seed-0)/config\.json", command)
     if folder:  # the options of a run that is there
         earlier = f"uv run recipes/wind_turbine.py --quick --overwrite --log-dir {folder[1]}"

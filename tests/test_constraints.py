@@ -15,8 +15,9 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.config import ConstraintsConfig, ExogenousConfig
+from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.plan import Constraints, MultiStart, WholeEpisodes
+from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 POSITION = {"position": (-1.0, 3.0)}

@@ -9,10 +9,9 @@ from test_algorithm import flown, twinning, weights
 
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.config import AssimilationConfig, RefereeConfig
 from rt_torchrl.steps.report import EpisodeReport, findings
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 
 def unsound(found, monkeypatch, episodes):

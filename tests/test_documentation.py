@@ -19,12 +19,11 @@ import rt_torchrl
 from rt_torchrl import check_plant, load_run
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.contract.check import require_controller
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.steps.hypotheses.ensemble import ALONE
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE
 
 RUN_HERE = "README finished_run gallery habits heated_room hypotheses own_plant quadrotor unknown_systems".split()
 

@@ -29,13 +29,12 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.operated import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import LearnerConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
-from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 
 class Falling(LinearQuadratic):

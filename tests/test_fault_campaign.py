@@ -37,7 +37,8 @@ from rt_torchrl.systems.faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEM
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -15,7 +15,8 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import FaultySystem, Injection
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 
 DT, N = 0.1, 40
 WATCHED = {

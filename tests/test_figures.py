@@ -29,12 +29,10 @@ from rt_torchrl.figures.style import ROLES
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record, results
 from rt_torchrl.runs.results_table import merit_lines
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}
 

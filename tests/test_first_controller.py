@@ -11,13 +11,11 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
 from rt_torchrl.steps.start import FirstController
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 GAINS = (0.4, 0.3)
 

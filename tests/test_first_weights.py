@@ -8,8 +8,9 @@ from test_assimilation import flight, of_segments
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 
 class Folded(torch.nn.Module):

@@ -17,15 +17,15 @@ from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, counting, evidence
+from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.hypotheses.fit import AGAIN, FIRST, Reread, misfit, reread, with_hidden_states
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, counting, evidence
-from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.twinning.hypotheses.fit import AGAIN, FIRST, Reread, misfit, reread, with_hidden_states
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
@@ -325,7 +325,7 @@ def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
             return 100.0 if name == "late" else 1.0
 
         monkeypatch.setattr(fit, "update", update)
-    replayed = "rt_torchrl.twinning.hypotheses.assimilation.misfit"
+    replayed = "rt_torchrl.steps.hypotheses.assimilation.misfit"
     monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is late else 1.0)
     for done in range(20):  # noqa: B007  (the updates read it)
         assimilation.update([record], (), 1, torch.Generator())
@@ -345,7 +345,7 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
     monkeypatch.setattr(Assimilation, "update", update)
     for fit in assimilation.fits.values():
         monkeypatch.setattr(fit, "update", lambda *_: 1.0)
-    replayed = "rt_torchrl.twinning.hypotheses.assimilation.misfit"
+    replayed = "rt_torchrl.steps.hypotheses.assimilation.misfit"
     monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is twin.twins[ALONE] else 1.0)
     for done in range(14):
         if done == 13:

@@ -24,10 +24,11 @@ from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, st
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 pd = pytest.importorskip("pandas")
 RECIPES = Path(__file__).parent.parent / "recipes"

@@ -9,12 +9,11 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import root
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.steps.config import LearnerConfig
+from rt_torchrl.steps.config import LearnerConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.config import TwinningConfig
 
 # All else, prioritised replay among it, is the library's default; so is the recipe of the wind turbine.
 LEARNER = LearnerConfig(return_steps=10)

@@ -24,8 +24,8 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.config import HypothesesConfig
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
 WITHOUT_NEURAL_CLOSURE = ("pendulum",)
@@ -116,8 +116,8 @@ from room import Room
 from rt_torchrl import Run, load_run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.config import HypothesesConfig
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 print("runs")
 @dataclass(frozen=True, kw_only=True)
 class Config(RunConfig):

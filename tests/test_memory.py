@@ -2,7 +2,7 @@
 
 import pytest
 
-from rt_torchrl.twinning.short_term_memory import ShortTermMemory
+from rt_torchrl.steps.flight import ShortTermMemory
 
 
 def test_short_term_memory_keeps_the_last_episodes_in_order():

@@ -19,11 +19,12 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import main_of
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.engines.interval import Interval
 from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise
 from rt_torchrl.trajectories.rollout import drive_of
 from rt_torchrl.trajectories.twin import DigitalTwin, jacobians_of
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "wind_turbine.py"
 PLANTS = [WindTurbine(horizon=20.0), FlappingWing(horizon=0.01), CryogenicTank(horizon=1200.0)]

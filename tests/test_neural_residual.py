@@ -11,13 +11,12 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.steps.hypotheses.ensemble import ALONE
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE
 
 RANGES = {"position": (-3.0, 3.0), "velocity": (-3.0, 3.0)}
 FORCE = "unknown force"

@@ -16,7 +16,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.operated import learner_threads
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.faulty_system import FaultySystem, Injection
@@ -28,11 +28,10 @@ from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 QUIET = ExplorationConfig(episodes=0)
 NOISY = ExplorationConfig(episodes=3, spread=0.2)

@@ -34,12 +34,12 @@ from rt_torchrl.envs.cryogenic_tank.unknown import TwoZones
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.protocols.served_system import served_system
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
 DT = 0.1
 

@@ -19,12 +19,13 @@ from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
 from rt_torchrl.fit.log import checked
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 recorded = recipe("record_log").recorded
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"

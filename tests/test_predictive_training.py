@@ -22,14 +22,13 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import PlannerConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, ShortHorizonConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2))
 FIT = AssimilationConfig(iterations=10, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0))

@@ -21,18 +21,18 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import (
+    AssimilationConfig,
     ExogenousConfig,
     LearnerConfig,
     LongTermMemoryConfig,
     PlannerConfig,
     RefereeConfig,
     ShortHorizonConfig,
+    TwinningConfig,
 )
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.safety import SafetyConfig
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 HEADER = "! TurbSim\n"
 LINE = "{time:.2f} {speed:g} 0 0 0 0 0 0\n"

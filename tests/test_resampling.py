@@ -31,10 +31,11 @@ from rt_torchrl.fit.resampling import (
     sensors_in,
 )
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
+from rt_torchrl.steps.hypotheses.fit import reread
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.hypotheses.fit import reread
 
 pd = pytest.importorskip("pandas")
 

@@ -31,11 +31,10 @@ from rt_torchrl.runs.results_table import SCREEN, closure_lines, fit_lines, next
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.engines.parallel import watched_compilation
-from rt_torchrl.twinning.config import TwinningConfig
 
 
 def refused(name):

@@ -19,12 +19,10 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):

@@ -16,16 +16,15 @@ from torchrl.envs.utils import check_env_specs
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
 from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.reading import Actuation, Reading
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
 
 DT = 0.1
 

@@ -22,16 +22,14 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.report import findings
 from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 
 record_log = recipe("record_log")
 ClassicalLaw, recorded = record_log.ClassicalLaw, record_log.recorded

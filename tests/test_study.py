@@ -12,8 +12,9 @@ from handwritten_study import EPISODES, finish, finished, recipe, results
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.study import figures as charts
 from rt_torchrl.study import page, tables
+from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.comparison import comparison_figure, comparison_table, entries_of
-from rt_torchrl.study.results import Entry, arm_entry, difference, mean_interval, weight_error
+from rt_torchrl.study.results import Entry, arm_entry, difference, weight_error
 from rt_torchrl.study.tables import difference_table, paper_table
 from rt_torchrl.study.training import VARIANTS, Training
 

@@ -108,7 +108,7 @@ PRESSED = """
 import os, signal
 from unittest.mock import patch
 from small_recipe import Config, main as train
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.algorithm import ReinforcementTwinning
 
 INTERACT = ReinforcementTwinning.interact
 

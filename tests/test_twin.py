@@ -12,13 +12,14 @@ from rt_torchrl import shipped_plants
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
+from rt_torchrl.steps.hypotheses.choice import extended
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import code, parallel
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin, Sensitivities, constant
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.hypotheses.choice import extended
 
 
 def twin_and_policy():

@@ -15,11 +15,11 @@ from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
 

@@ -18,11 +18,9 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
 from rt_torchrl.runs.loggers import LoggerName, require_loggers
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import HypothesesConfig, Role, TwinningConfig
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""

@@ -7,6 +7,8 @@ from typing import Literal
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, require_widths
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 
 Role = Literal["model_free", "model_based"]
 Arm = Literal["twinning", "model_free", "model_based"]
@@ -302,3 +304,190 @@ class RefereeConfig:
         for argument in ("tolerance", "stall"):
             if not getattr(self, argument) > 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssimilationConfig:
+    """Parameters of step 4.
+
+    Args:
+        iterations: number n_G of gradients per episode.
+        stop_ratio: share of the J_p at the start of the episode below which the descent ends; with 0 it never ends
+            early.
+        inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
+            paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
+            it also does not find weights that move the states less than that chance does.
+        method: method of the fit: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the
+            normal equations from forward sensitivities, for closures of some ten weights, and does not use ``descent``.
+        starts: number of first weights in every episode: the present ones, those of the first closure, and then these
+            two in turns, moved at random. The best fit stays, as a law that has bent to one record may be in a local
+            minimum of the next ones. More than 1 needs ``levenberg_marquardt`` and ``initial="measured"``.
+        prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
+            perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
+            keep their initial values, and so the law keeps its initial form where no record has been.
+        segment: number of control intervals after which the replay starts again from the measured state (multiple
+            shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
+            weights, so a closure with many weights fits the record in a few steps. J_p is then the mean over the
+            segments. None lets the data choose: whole records, unless the twin is unstable and leaves
+            them; then the longest segments that it follows as well as shorter ones.
+        initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
+            else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
+            that forgets slowly carries the error of the first reading through the whole record, and the weights would
+            make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        sensors: names of the states and measurements that sensors read, to which the twin is fitted by maximum
+            likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
+            states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
+            the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
+            ``levenberg_marquardt``, the inputs of the ``record`` and ``initial="estimated"``.
+        biased: names of the sensors that may be off by a constant, which is estimated.
+        descent: parameters of the closure's descent.
+    """
+
+    iterations: int = 15
+    stop_ratio: float = 0.0
+    inputs: Literal["realisations", "record"] = "realisations"
+    method: Literal["gradient", "levenberg_marquardt"] = "gradient"
+    starts: int = 1
+    prior: float = 0.0
+    segment: int | None = None
+    initial: Literal["measured", "estimated"] = "measured"
+    sensors: tuple[str, ...] = ()
+    biased: tuple[str, ...] = ()
+    descent: DescentConfig = field(default_factory=DescentConfig)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.iterations < 0:
+            raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
+        if not 0.0 <= self.stop_ratio < 1.0:
+            raise ValueError(f"stop_ratio={self.stop_ratio} must lie in [0, 1).")
+        if not self.prior >= 0.0:
+            raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
+        if self.segment is not None and self.segment < 0:
+            raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
+        if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
+            raise ValueError(
+                f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
+                f"are {self.method!r} and {self.inputs!r}."
+            )
+        if self.sensors and (self.initial != "estimated" or self.segment):
+            raise ValueError(
+                f"sensors={self.sensors} of the assimilation need initial='estimated' and no segment; they are "
+                f"{self.initial!r} and {self.segment}."
+            )
+        if self.biased and not self.sensors:
+            raise ValueError(
+                f"biased={self.biased} of the assimilation belongs to a fit to sensors; give sensors, too."
+            )
+        if self.starts < 1 or (self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured")):
+            raise ValueError(
+                f"starts={self.starts} of the assimilation must be at least 1, and more than 1 need "
+                f"method='levenberg_marquardt' and initial='measured', not {self.method!r} and {self.initial!r}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HypothesesConfig:
+    r"""Parameters of the hypotheses, whose weights are :math:`w_h \propto p_h (\epsilon_{min}/\epsilon_h)^\kappa`.
+
+    Here ε is the J_p with which a hypothesis replays the records.
+
+    Args:
+        which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), or ``none`` for the twin alone.
+        call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
+            which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
+            always.
+        names: names of the suspects that are taken, also of those that are taken only by name
+            (:meth:`Plant.further_suspects`); all of the others if there are none.
+        prior: prior weight p_h of every addition, as a share of that of the twin alone. A small one asks for evidence
+            before anything is added.
+        sharpness: exponent κ, which stands for the number of independent samples in the records.
+        least: weight, as a share of the greatest one, below which a hypothesis is left out of the plan.
+        segment: number of control intervals after which a replay begins again with what was read; by default a sixtieth
+            of an episode.
+        risk: share ρ of the worst hypothesis in the cost that is planned on, (1 − ρ) Σ w_h J_h + ρ max J_h.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+    """
+
+    which: Literal["none", "automatic"] = "automatic"
+    call: float = 0.05
+    names: tuple[str, ...] = ()
+    prior: float = 0.01
+    sharpness: float = 6.0
+    least: float = 0.1
+    segment: int | None = None
+    risk: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("prior", "sharpness"):
+            if not getattr(self, argument) > 0.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must be positive.")
+        for argument in ("least", "risk"):
+            if not 0.0 <= getattr(self, argument) < 1.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must lie in [0, 1).")
+        if not self.call >= 0.0:
+            raise ValueError(f"call={self.call} of the hypotheses must not be negative.")
+        if self.segment is not None and self.segment < 2:
+            raise ValueError(f"segment={self.segment} of the hypotheses must be at least 2 control intervals.")
+        if self.names and self.which == "none":
+            raise ValueError(f"names={self.names} of the hypotheses need which='automatic'; it is 'none'.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinningConfig:
+    """Hyper-parameters of the algorithm, by step.
+
+    Args:
+        arm: part of the algorithm that runs: ``twinning`` for all six steps, ``model_free`` for steps 1 and 2 alone, or
+            else ``model_based`` for steps 1, 3, 4 and 5 alone.
+        realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
+        records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
+            from at least as many.
+        virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        least_sound: least share of a real episode without a fault, in a row, that is learned from; with a lower share
+            the episode is flown again.
+        limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
+            to be kept before a policy may act.
+        exploration: parameters of step 1.
+        learner: parameters of step 2.
+        exogenous: parameters of step 3.
+        assimilation: parameters of step 4.
+        hypotheses: parameters of the hypotheses about what the real system has beside its twin.
+        planner: parameters of step 5.
+        referee: parameters of step 6.
+    """
+
+    arm: Arm = "twinning"
+    realisations: int = 5
+    records: int = 1
+    virtual_episodes: int = 20
+    least_sound: float = 0.5
+    limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
+    assimilation: AssimilationConfig = field(default_factory=AssimilationConfig)
+    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    referee: RefereeConfig = field(default_factory=RefereeConfig)
+
+    @property
+    def experience(self) -> int:
+        """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
+        return max(self.records, self.planner.experience)
+
+    @property
+    def bounded_states(self) -> dict[str, tuple[float, float]]:
+        """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
+        return {**self.limits.states, **self.planner.constraints.states}
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("realisations", "records", "virtual_episodes"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+        if not 0.0 < self.least_sound <= 1.0:
+            raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")

@@ -1,24 +1,223 @@
-"""Step 1: one episode on the real system, and what of it is learned from."""
+"""Step 1: one episode on the real system, what of it is sound, and which policy may act."""
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
+from rt_torchrl.steps.flight import Flight, RealFlights, ShortTermMemory, together
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.report import Step, findings, merged
+from rt_torchrl.steps.report import Step, as_findings, findings, merged, plain
+from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.systems.operation.operation import Operation
+from rt_torchrl.systems.operation.order import FIRST, Order
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.clearance import Clearance
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.flight import Flight, RealFlights
-from rt_torchrl.twinning.operating import Operating
-from rt_torchrl.twinning.short_term_memory import ShortTermMemory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+
+
+class Cleared(NamedTuple):
+    """The policy that may act, the role whose weights it has, and the report of the check."""
+
+    policy: nn.Module
+    role: Role
+    report: TensorDict
+
+
+class Clearance:
+    """Lets a policy act only if the twin predicts that it keeps the limits.
+
+    The live policy is asked first, then the idle one, then the weights that were cleared last. Before the first real
+    episode there are no virtual episodes, and the live policy acts unchecked, behind the safety layer.
+
+    Args:
+        env: the real system, which needs a safety layer if there are limits.
+        policies: both policies by role.
+        virtual: virtual episodes.
+        config: the limits.
+
+    Raises:
+        ValueError: if the plant has no such limits, see :class:`OperatingLimits`, or the real system no safety layer.
+    """
+
+    def __init__(
+        self, env: EnvBase, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, config: OperatingLimitsConfig
+    ):
+        if config:
+            require_layer(env)
+        self.policies, self.virtual, self.config = policies, virtual, config
+        self.limits = OperatingLimits(virtual.twin.plant, config)
+        self._last: tuple[Role, dict[str, Tensor]] | None = None
+
+    @torch.no_grad()
+    def choose(self, live: Role, count: int) -> Cleared:
+        """The policy that may act.
+
+        Args:
+            live: role that the referee wants to act.
+            count: number of virtual episodes of the check.
+
+        Returns:
+            The policy. The report holds ``predicted_violations``, its share of control intervals beyond a limit, and a
+            reason for each policy that is refused.
+
+        Raises:
+            ValueError: if no policy may act.
+        """
+        if not self.config or not self.virtual.processes:
+            return Cleared(self.policies[live], live, findings())
+        episodes, reasons = self.virtual.draw(count), list[str]()
+        for role in (live, *(other for other in ROLES if other != live)):
+            share = self.predicted(self.policies[role], episodes)
+            if share <= self.config.tolerated:
+                self._last = role, copy.deepcopy(self.policies[role].state_dict())
+                return Cleared(self.policies[role], role, findings(*reasons, predicted_violations=share))
+            reasons.append(f"{role} may not act: it would leave the limits in {100.0 * share:.3g} % of the intervals")
+        if self._last is None:
+            raise ValueError(
+                f"no policy may act. {'; '.join(reasons)}; limits.tolerated={self.config.tolerated}. Widen the limits "
+                "or raise that share, or begin with something that keeps the limits, such as --start controller."
+            )
+        role, weights = self._last
+        policy = copy.deepcopy(self.policies[role])
+        policy.load_state_dict(weights)
+        return Cleared(policy, role, findings(*reasons, predicted_violations=self.predicted(policy, episodes)))
+
+    def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
+        """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
+        try:
+            flown = self.virtual.twin.control(policy, *episodes)
+        except DivergenceError:
+            return 1.0
+        broken = self.limits.broken(flown)
+        return torch.stack(list(broken.values())).any(0).double().mean().item()
+
+    def counted(self, flown: Trajectory) -> TensorDict:
+        """Numbers of control intervals of a real episode beyond each kind of limits; nothing without limits."""
+        if not self.config:
+            return findings()
+        broken = self.limits.broken(flown)
+        return findings(**{f"violations/{kind}": found.sum().double() for kind, found in broken.items()})
+
+    def state_dict(self) -> dict[str, Any]:
+        """The role and weights that were cleared last."""
+        return {"last": None if self._last is None else {"role": self._last[0], "weights": self._last[1]}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        last = state["last"]
+        self._last = None if last is None else (last["role"], last["weights"])
+
+
+@runtime_checkable
+class Trainer(Protocol):
+    """What :class:`Operating` needs of the algorithm."""
+
+    policies: dict[Role, nn.Module]
+    clearance: Clearance
+    flights: RealFlights
+    config: TwinningConfig
+    belief: Belief
+    short_term: ShortTermMemory
+    judged: int
+
+    @property
+    def virtual(self) -> VirtualEpisodes:
+        """Virtual episodes of the twin."""
+
+
+class Operating:
+    """Takes the windows of an operation, and hands policies over.
+
+    A window counts as flown by the version that acted in most of it, or the later of two. Windows that the system flew
+    under what the training begins with are learned from, and never compared with a policy's predictions.
+
+    Args:
+        operation: the real system in operation.
+        trainer: the algorithm.
+    """
+
+    def __init__(self, operation: Operation, trainer: Trainer):
+        self.operation, self.trainer, self._exploration = operation, trainer, trainer.config.exploration
+
+    def fly_first(self, teacher: nn.Module) -> Flight:
+        """One window under what the training begins with, which then acts on until the first policy takes over."""
+        self.operation.hand_over(FIRST, teacher, strength=0.0)
+        return self.trainer.flights.fly_first(teacher)
+
+    def hand_over(self, role: Role, episode: int) -> None:
+        """Hand over the policy that acts now, or another one if the twin predicts that it would leave the limits.
+
+        Args:
+            role: role that is live.
+            episode: number of the learner's episode, from 0.
+        """
+        policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
+        strength = self._exploration.strength(episode)
+        self.operation.hand_over(role, policy, strength=strength, found=plain(report))
+
+    def take(self, live: Role, episode: int) -> tuple[Sequence[Flight], TensorDict]:
+        """Take every window that has come in; wait until one is of a policy.
+
+        Args:
+            live: role that acts from the first episode on.
+            episode: number of the learner's episode, from 0; before the first one nothing was handed over.
+
+        Returns:
+            The windows, oldest first; ``real_cost``, the mean J_a of the ``windows``, and what was measured of the
+            control intervals.
+        """
+        if episode == 0:
+            self.hand_over(live, 0)
+        flights, policy_flew = list[Flight](), False
+        while not policy_flew or self.operation.waiting():
+            if flights and flights[-1].whole and self.trainer.config.arm != "model_free":
+                self.trainer.virtual.learn(flights[-1].record)  # step 3 fits the last one
+            flight = self._taken()
+            self.trainer.short_term.append(flight.record)
+            flights.append(flight)
+            order = self._order_of(flight)
+            if order.name != FIRST:
+                policy_flew = True
+                self._note(flight, order)
+        return flights, self._report(flights)
+
+    def _taken(self) -> Flight:
+        needed = self.trainer.virtual.wanting(self.trainer.config.arm)
+        return self.trainer.flights.fly(self.trainer.policies["model_free"], strength=0.0, whole=needed)
+
+    def _order_of(self, flight: Flight) -> Order:
+        versions = flight.transitions["version"].flatten()
+        found, counts = versions.unique(return_counts=True)
+        return self.operation.orders[int(found[counts == counts.max()].max())]
+
+    def _note(self, flight: Flight, order: Order) -> None:
+        if not flight.whole:
+            return  # costs of parts cannot be compared with those of windows
+        role, cost = cast(Role, order.name), flight.cost.item()
+        explored = order.strength * self._exploration.spread
+        self.trainer.belief.append(flight.record, role, cost, explored, order.weights)
+
+    def _report(self, flights: list[Flight]) -> TensorDict:
+        order = self._order_of(flights[-1])
+        cost = torch.stack([flight.cost for flight in flights]).mean()
+        report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
+        report.update(findings(windows=float(len(flights)), version=float(order.version)))
+        merged(report, as_findings(order.found or {})).update(findings(**(self.operation.acted or {})))
+        counted = [self.trainer.clearance.counted(flight.record) for flight in flights]
+        kinds = counted[0].keys()
+        report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
+        late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
+        if late.any():
+            period = 1e3 * late
+            report.update(findings(late_median=period.median(), late_p99=period.quantile(0.99), late_max=period.max()))
+        return report.set_non_tensor("live", order.name)
 
 
 class Interact(Step):

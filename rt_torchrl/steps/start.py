@@ -9,12 +9,12 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.config import Arm, Role
+from rt_torchrl.steps.flight import Flight
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.report import same_architecture
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.flight import Flight
-from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 
 Fly = Callable[[nn.Module], Flight]
 """Function that lets a policy or state feedback fly one episode on the real system, without exploration."""

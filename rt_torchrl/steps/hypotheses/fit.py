@@ -21,12 +21,13 @@ from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import ResidualRates
-from rt_torchrl.trajectories.engines import Native
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 FIRST = 3 * ("short", "whole")
 """Stages of the first fit: steps over segments, and over whole records."""

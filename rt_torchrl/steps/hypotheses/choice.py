@@ -8,12 +8,12 @@ from torch import nn
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.steps.assimilate import Assimilation, SensorAssimilation
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, SensorAssimilation
-from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 
 
 def make_twin(

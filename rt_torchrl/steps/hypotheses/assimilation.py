@@ -8,12 +8,12 @@ import torch
 
 from rt_torchrl.fit.least_squares import SHORT
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.hypotheses.fit import Fit, Turns, misfit
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.twinning.hypotheses.fit import Fit, Turns, misfit
 
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
