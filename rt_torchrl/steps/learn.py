@@ -79,7 +79,7 @@ class Learner(Protocol):
 class LearningMethod(NamedTuple):
     """A model-free method: the loss, and what it needs.
 
-    Attributes:
+    Args:
         make_loss: function of actor and critics, in the form that TorchRL's losses take, that makes the loss. Actions
             are scaled to [−1, 1].
         critics: number of critics.
