@@ -12,7 +12,6 @@ if __name__ == "__main__":
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 from rt_torchrl import OperationConfig, check_options, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
@@ -74,6 +73,8 @@ class Learner:
         from wind_turbine import CONVERGED
 
         self.algorithm = ReinforcementTwinning(env, twin, **self.policies, config=CONVERGED, generator=generator)
+        from tensordict import TensorDict  # here, because it takes seconds to load, and a command line needs none
+
         self.episode = self.algorithm(TensorDict({"number": 0}))
 
     def learn(self) -> float:

@@ -259,14 +259,6 @@ def test_sensitivities_start_at_their_own_time():
             torch.testing.assert_close(one[b], other[0], rtol=1e-12, atol=1e-14)
 
 
-def test_a_start_for_each_is_refused_by_the_engine_that_has_one_span():
-    plant = LinearQuadratic(horizon=1.0)
-    rollout = Rollout(plant, plant.closure, engine="odeint_adjoint")
-    state, inputs = torch.zeros(2, 2).double(), torch.zeros(2, 10, 1).double()
-    with pytest.raises(ValueError, match="takes no start for each"):
-        rollout(state, inputs, inputs, start=torch.tensor([0.0, 1.0], dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("segment", "message"), [(-1, "segment=-1"), (51, "segment=51 of the assimilation exceeds the 50")]
 )

@@ -15,6 +15,7 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_settings import as_written
 from rt_torchrl.runs.settings import config_of
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
@@ -27,6 +28,7 @@ LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force
 
 def limited(limits=LIMITS, **options):
     plant = LinearQuadratic(horizon=2.0)
+    options = {"referee": RefereeConfig(rule="decision_tree")} | options  # which keeps every update
     parts = twinning(plant, limits=OperatingLimitsConfig(), **options)
     config = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
     layer = SafetyLayer(PlantEnv(plant, seed=0), config, fallback=(0.0,))

@@ -154,8 +154,8 @@ def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch
 
 
 METHODS = [
-    AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
-    AssimilationConfig(iterations=2, method="levenberg_marquardt"),
+    AssimilationConfig(iterations=2, segment=0, descent=DescentConfig(rate=0.01)),
+    AssimilationConfig(iterations=2, segment=0, method="levenberg_marquardt"),
 ]
 
 

@@ -13,6 +13,7 @@ from test_algorithm import twinning
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import FaultySystem, Injection
 from rt_torchrl.systems.safety import SafetyLayer
@@ -48,6 +49,7 @@ def guarded(*injections, plant=None, **options):
 
 
 def algorithm(env, **changes):
+    changes = {"referee": RefereeConfig(rule="decision_tree")} | changes
     parts = twinning(LinearQuadratic(horizon=DT * N), **changes)
     generator = torch.Generator().manual_seed(0)
     return ReinforcementTwinning(env, parts.twin, config=parts.config, generator=generator, **parts.policies)

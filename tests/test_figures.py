@@ -29,7 +29,7 @@ from rt_torchrl.figures.style import ROLES
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record, results
 from rt_torchrl.runs.results_table import merit_lines
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -49,6 +49,7 @@ def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
         learner=LearnerConfig(critic_iterations=2, actor_iterations=2, batch_size=8),
         assimilation=AssimilationConfig(iterations=2),
         planner=PlannerConfig(iterations=1),
+        referee=RefereeConfig(rule="decision_tree"),
     )
     policies = {"model_free": policy, "model_based": copy.deepcopy(policy)}
     twinning = ReinforcementTwinning(PlantEnv(plant), twin, **policies, config=config, generator=generator)

@@ -138,20 +138,6 @@ def test_segments_start_from_the_record(plant):
     assert seen[0].cost.item() == pytest.approx(torch.stack(costs).mean().item(), rel=1e-9)
 
 
-def test_what_is_reported_for_segments_is_the_whole_record():
-    plant = LinearQuadratic(horizon=4.0, noise=0.0)
-    results = []
-    for segment in (0, 10):
-        twin, flown, exogenous = recorded(plant, batch=1)
-        config = AssimilationConfig(segment=segment, inputs="record", method="levenberg_marquardt")
-        record = flown.each()[0]
-        results.append(Assimilation(twin, config).update([record], [], 1, seeded()))
-        # A noise-free record: both find the true matrix.
-        torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-7)
-    assert results[0].start == pytest.approx(results[1].start, rel=1e-12)
-    assert results[1].best < 1e-12 * results[1].start
-
-
 class Corrected(nn.Module):
     """The law that a twin starts from and a perceptron of one layer."""
 

@@ -108,10 +108,11 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     algorithm.episode()
     algorithm.referee.live = "model_based"
     judged = algorithm.virtual.draw(2)
-    found = algorithm.clone(judged)
+    record, switch = algorithm.short_term[-1], algorithm.module["switch"]
+    found = switch.clone(record, judged)
     assert 0.0 < found["distillation_error"] < 0.3
     algorithm.referee.live = "model_free"
-    refused = algorithm.clone(judged)
+    refused = switch.clone(record, judged)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()
 

@@ -76,7 +76,7 @@ def test_wind_that_no_turbine_has_met_is_refused(tmp_path):
     file = tmp_path / "storm.hh"
     file.write_text(HEADER + "".join(LINE.format(time=0.5 * k, speed=1e42 if k == 7 else 11.0) for k in range(1300)))
     with pytest.raises(
-        ValueError, match=r"wind_files: .*storm.hh: wind speed at t = 3.5 s is 1e\+42 m/s; it must not exceed 200 m/s"
+        ValueError, match=r"wind_files: .*storm.hh: wind speed at t = 3.5 s is 1e\+42 m/s; it must be from 0 to 200 m/s"
     ):
         made("wind_turbine", wind_files=(file,))
 

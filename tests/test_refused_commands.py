@@ -393,7 +393,7 @@ def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
 
 def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():
     found = algorithm(PlantEnv(LinearQuadratic(horizon=HORIZON)))
-    for weight in found.learner.critic.parameters():
+    for weight in found.learner.critic_adam.weights:
         weight.data.fill_(NAN)
     with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
         found.episode()

@@ -28,6 +28,7 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.results_table import SCREEN, closure_lines, fit_lines, next_steps, results_table
+from rt_torchrl.runs.results_table import progress as progress_line
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
@@ -434,4 +435,4 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     assert fit_lines({"rms": {}, "segment": 0, "standard_errors": {}}) == fit_lines(None) == []
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
     record |= {f"rms/{name}": value for name, value in rms.items()}
-    assert progress(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
+    assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"

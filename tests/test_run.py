@@ -14,12 +14,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl import PlantContractError
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
+from rt_torchrl.steps.plan import MakePlan
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
@@ -225,14 +225,14 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
 
 def interrupted_in(episode, monkeypatch):
     """Let Ctrl-C come in step 5 of an episode, counted from 0."""
-    plan = ReinforcementTwinning.plan
+    plan = MakePlan.forward
 
-    def interrupted(self):
-        if self.episodes_done == episode:
+    def interrupted(self, flowing):
+        if flowing["number"] == episode:
             raise KeyboardInterrupt
-        return plan(self)
+        return plan(self, flowing)
 
-    monkeypatch.setattr(ReinforcementTwinning, "plan", interrupted)
+    monkeypatch.setattr(MakePlan, "forward", interrupted)
 
 
 def test_an_interrupt_keeps_the_episodes_done(tmp_path, monkeypatch):

@@ -17,7 +17,6 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from torch import nn
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import checkpoint
@@ -27,6 +26,7 @@ from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.run_settings import require_same
 from rt_torchrl.runs.settings import BESIDE, config_of, read_settings
 from rt_torchrl.runs.tensor_file import load_tensors, plain, save_tensors
+from rt_torchrl.steps.plan import MakePlan
 
 HOLDER = """
 import sys
@@ -438,7 +438,7 @@ def test_a_checkpoint_holds_tensors_in_plain_containers(folder):
     found = torch.load(folder / "checkpoint.pt", weights_only=True)
     assert plain(found).keys() == {"format", "episodes", "state"} and len(found["episodes"]) == 2
     assert (
-        found["state"]["algorithm"]["learner"]["memory"]["count"] == 40
+        found["state"]["algorithm"]["module.learn._extra_state"]["learner"]["memory"]["count"] == 40
     )  # two episodes of 20 transitions, none of the 460 free places
 
 
@@ -507,19 +507,36 @@ def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
     assert len(checkpoint.load(tmp_path / "checkpoint.pt", algorithm)) == 2
 
 
-@pytest.mark.parametrize("part", ["policies", "learner", "short_term", "virtual", "referee", "env"])
-def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, part):
+@pytest.mark.parametrize(
+    ("step", "part"),
+    [
+        ("learn", "learner"),
+        ("interact", "short_term"),
+        ("inputs", "virtual"),
+        ("switch", "referee"),
+        ("interact", "env"),
+    ],
+)
+def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, step, part):
     found = load_tensors(folder / "checkpoint.pt")
-    del found["state"]["algorithm"][part]
+    del found["state"]["algorithm"][f"module.{step}._extra_state"][part]
     save_tensors(tmp_path / "checkpoint.pt", found)
     algorithm = small_run(tmp_path / "run", **QUICK).algorithm
     with pytest.raises(ValueError, match=f"weights do not fit this training.*{part}"):
         checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
 
 
+def test_a_checkpoint_without_a_policy_does_not_fit(folder, tmp_path):
+    found = load_tensors(folder / "checkpoint.pt")
+    del found["state"]["algorithm"]["model_free.gain"]
+    save_tensors(tmp_path / "checkpoint.pt", found)
+    with pytest.raises(ValueError, match=r"weights do not fit this training.*policies.*model_free\.gain"):
+        checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
+
+
 def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
     save_tensors(tmp_path / "checkpoint.pt", load_tensors(folder / "checkpoint.pt") | {"format": 2})
-    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 4"):
+    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 5"):
         checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
 
 
@@ -546,11 +563,11 @@ def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
-    def killed(self):
+    def killed(self, episode):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(ReinforcementTwinning, "plan", killed)
+        patched.setattr(MakePlan, "forward", killed)
         with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
             small_run(tmp_path, episodes=1, **QUICK).train()
     with pytest.raises(ValueError, match="holds a run already.*--resume it, or --overwrite it"):

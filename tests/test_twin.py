@@ -340,9 +340,3 @@ def test_rounding_ends_the_run():
         return valley.equations()
 
     assert LevenbergMarquardt(valley).run(equations, 15).iterations == 0 and calls == 1
-
-
-@pytest.mark.parametrize("argument", ["damping", "longest_step"])
-def test_parameters_out_of_range_are_refused(argument):
-    with pytest.raises(ValueError, match=f"{argument}=0.0"):
-        LevenbergMarquardt(Valley(), **{argument: 0.0})

@@ -12,7 +12,7 @@ from rt_torchrl.runs.tensor_file import DamagedFileError, load_tensors, save_ten
 
 NAME = "checkpoint.pt"
 """File of the newest checkpoint in a run folder."""
-FORMAT = 4
+FORMAT = 5
 NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
 """Name of an earlier checkpoint."""
 FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -84,11 +84,10 @@ class Rollout:
             initial_state: initial state s_0 of each realisation.
             exogenous: exogenous inputs z, held over each interval.
             command: actions from a record; None if there is a policy.
-            start: time of s_0 [s], one for all realisations, or one for each if the engine supports this.
+            start: time of s_0 [s], one for all realisations, or one for each.
 
         Raises:
-            ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
-                does not take a start for each realisation.
+            ValueError: if shapes do not fit the plant and each other, or commands are given beside a policy.
             DivergenceError: if a state is not finite; the message names plant, realisation, time and state.
             ImpureError: if policy, closure or plant answer one question in two ways, or mix realisations.
         """
@@ -138,11 +137,6 @@ class Rollout:
         if self._driven is not None and self._driven[0] == key and not differentiated:
             return self._driven[1]
         self._validate(initial_state, exogenous, command)
-        if isinstance(start, Tensor) and not self._engine.exact:
-            raise ValueError(
-                f"engine={self.engine!r} integrates all realisations over the same span and takes no start for each; "
-                f"use {_exact()}, or whole records (segment=0)."
-            )
         drive = drive_of(self.plant, exogenous, command, start=start)
         self._driven = None if differentiated else (key, drive, tensors)
         return drive

@@ -116,7 +116,7 @@ class GradientEngine:
 
     exact: ClassVar[bool] = True
     """Whether the engine differentiates the plant's own step. One that integrates the vector field takes no plant with
-    another scheme (:attr:`Plant.own_scheme`) or with early ends, and the same start for all realisations."""
+    another scheme (:attr:`Plant.own_scheme`) or with early ends."""
 
     def __init__(self, *, compiled: bool = False):
         pass
@@ -143,11 +143,12 @@ class Autograd(GradientEngine):
 class OdeintAdjoint(GradientEngine):
     r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals: the paper's continuous adjoint.
 
-    The applied action and the exogenous input are constant components of the integrated state. The co-state of an
-    action is then :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, and ordinary backpropagation
-    carries it on into the policy. The co-state is integrated backwards with the step of the forward solution, so that
-    the gradient differs from the exact one of the discrete trajectory by the order of that step. Nothing is compiled:
-    torchdiffeq goes back several times through one graph, which compiled code refuses.
+    The applied action, the exogenous input and the time at the start of an interval are constant components of the
+    integrated state, so that each realisation may have a start of its own. The co-state of an action is then
+    :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, and ordinary backpropagation carries it on
+    into the policy. The co-state is integrated backwards with the step of the forward solution, so that the gradient
+    differs from the exact one of the discrete trajectory by the order of that step. Nothing is compiled: torchdiffeq
+    goes back several times through one graph, which compiled code refuses.
     """
 
     exact: ClassVar[bool] = False
@@ -159,12 +160,11 @@ class OdeintAdjoint(GradientEngine):
         plant, n_s = interval.plant, initial_state.shape[-1]
         field = _HeldField(interval, n_s)
         weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
-        interval_span = torch.tensor([0.0, plant.dt], dtype=torch.float64, device=drive.t.device)
+        span = torch.tensor([0.0, plant.dt], dtype=torch.float64, device=drive.t.device)
 
         def integrated(t: Tensor, state: Tensor, applied: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
-            held = torch.cat([state, applied, exogenous], -1)
-            # The span is in absolute time: the backward pass evaluates the field again, long after this call.
-            span = t + interval_span
+            began = t.expand(state.shape[:-1]).unsqueeze(-1)
+            held = torch.cat([state, applied, exogenous, began], -1)
             return odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1, ..., :n_s]
 
         def step(state: Tensor, now: Drive) -> Tensor:
@@ -175,15 +175,15 @@ class OdeintAdjoint(GradientEngine):
 
 
 class _HeldField(nn.Module):
-    """The vector field of the held state, d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
+    """The vector field of the held state, d[s, a, z, t_0]/dt = [f(t_0 + t, s, a, z), 0, 0, 0]."""
 
     def __init__(self, interval: Interval, n_states: int):
         super().__init__()
         plant = interval.plant
-        self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs))
+        self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs), 1)
         self.vector_field = plant.vector_field
 
     def forward(self, t: Tensor, held: Tensor) -> Tensor:
-        state, action, exogenous = held.split(self.sizes, -1)
-        rate = self.vector_field(t, state, action, exogenous, self.closure)
-        return torch.cat([rate, torch.zeros_like(action), torch.zeros_like(exogenous)], -1)
+        state, action, exogenous, began = held.split(self.sizes, -1)
+        rate = self.vector_field(t + began.squeeze(-1), state, action, exogenous, self.closure)
+        return torch.cat([rate, torch.zeros_like(held[..., rate.shape[-1] :])], -1)
