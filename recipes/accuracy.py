@@ -20,8 +20,6 @@ from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, Trajectory, c
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.tensor_file import load_tensors
-from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.flight import ShortTermMemory
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.trajectories.trajectory import batch_of
@@ -125,10 +123,13 @@ class OverBest(NamedTuple):
 def over_best(training: Training, unseen: int) -> OverBest:
     """How the law of a training's twin compares with the best ones of its form."""
     from rt_torchrl.runs.checkpoint import NAME  # here, because --help need not wait for TorchRL
+    from rt_torchrl.steps.flight import ShortTermMemory
 
     run, count = load_run(training.folder), EPISODES[training.plant]
     memory = ShortTermMemory(count)
-    memory.load_state_dict(load_tensors(training.folder / NAME)["state"]["algorithm"]["short_term"])
+    memory.load_state_dict(
+        load_tensors(training.folder / NAME)["state"]["algorithm"]["module.interact._extra_state"]["short_term"]
+    )
     policy, seen = run.policies["model_based"], batch_of(memory)
     episodes = UnseenEpisodes(run.plant, unseen)
     flown, misfit = episodes.fly(policy), partial(misfit_of, episodes, run)
@@ -148,6 +149,8 @@ def over_best(training: Training, unseen: int) -> OverBest:
 
 def best_of(run: LoadedRun, misfit: Misfit, flown: Trajectory, starts: list[nn.Module]) -> nn.Module:
     """The law with the least J_p on episodes among those that are found from several first laws."""
+    from rt_torchrl.steps.assimilate import Assimilation  # here, because it loads TorchRL
+
     found = [copy.deepcopy(start).requires_grad_(True) for start in starts]
     for law in found:
         Assimilation(DigitalTwin(run.physics, law), TO_THE_END).update(flown.each(), [], 1, torch.Generator())

@@ -40,7 +40,7 @@ from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.flight import RealFlights, ShortTermMemory
-from rt_torchrl.steps.hypotheses.choice import make_assimilation
+from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, Operating

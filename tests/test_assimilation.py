@@ -17,7 +17,8 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation, FirstStates, SensorAssimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.ensemble import make_twin
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost

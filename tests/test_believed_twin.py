@@ -18,8 +18,7 @@ from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.results_table import hypothesis_lines, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import HypothesesConfig
-from rt_torchrl.steps.hypotheses.choice import extended
-from rt_torchrl.steps.hypotheses.ensemble import ALONE
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, extended
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 LAG = 0.35

@@ -6,6 +6,7 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
+from test_algorithm import flown as after
 from test_algorithm import twinning
 
 from rt_torchrl.algorithm import ReinforcementTwinning
@@ -88,7 +89,7 @@ def test_a_policy_that_would_leave_them_does_not_act():
     last = found.clearance.choose(live, 5)
     assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
     assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
-    assert flown(found)["live"] == idle
+    assert after(found)["live"] == idle
     assert torch.equal(found.belief.policy_of(found.belief.flown[-1]).gain, last.policy.gain)
 
 

@@ -20,8 +20,8 @@ from rt_torchrl import check_plant, load_run
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.steps.hypotheses.ensemble import ALONE
+from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 

@@ -16,9 +16,12 @@ from test_run_folder import Full
 from torch import nn
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.export import c_compiler, export_c, export_onnx, export_program, onnx_model
+from rt_torchrl.export import c_compiler, onnx_model
 from rt_torchrl.export.agreement import detached, sample_observations
+from rt_torchrl.export.c_policy import export_c
 from rt_torchrl.export.exported_policy import load_policy
+from rt_torchrl.export.onnx_model import export_onnx
+from rt_torchrl.export.program import export_program
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 

@@ -12,8 +12,9 @@ from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.export import c_compiler, export_c
+from rt_torchrl.export import c_compiler
 from rt_torchrl.export.c_compiler import c_array
+from rt_torchrl.export.c_policy import export_c
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.programs.c_source import CSource, literal

@@ -19,9 +19,8 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, counting, evidence
-from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, counting, evidence, make_assimilation
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble, make_twin
 from rt_torchrl.steps.hypotheses.fit import AGAIN, FIRST, Reread, misfit, reread, with_hidden_states
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of

@@ -12,8 +12,8 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.choice import make_assimilation, make_twin
-from rt_torchrl.steps.hypotheses.ensemble import ALONE
+from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -138,7 +138,7 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
-    "accuracy.py": {"evaluation", "runs", "study", "trajectories", "twinning"},
+    "accuracy.py": {"evaluation", "runs", "study", "trajectories", "steps"},
     "asynchronous.py": {"runs"},
     "benchmark.py": {"runs", "trajectories"},
     "cascaded_tanks.py": {"figures", "fit", "runs"},

@@ -331,7 +331,7 @@ def test_a_machine_whose_readings_stay_refused_ends_the_training():
     found = algorithm(layer(Spiky(plant, 1e5, episodes=3), **RANGES))
     with pytest.raises(ValueError, match=r"3 real episodes in a row .* refused 1 of its readings"):
         found.episode()
-    assert not len(found.learner.memory) and not found.short_term and found.episodes_done == 0
+    assert not len(found.learner.memory) and found.episodes_done == 0
     # The machine has been mended.
     assert found.episode()["real_cost"].isfinite() and len(found.learner.memory) == 20
 
@@ -397,4 +397,4 @@ def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():
         weight.data.fill_(NAN)
     with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
         found.episode()
-    assert not len(found.learner.memory) and not found.short_term
+    assert not len(found.learner.memory)

@@ -14,7 +14,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
-from rt_torchrl.steps.hypotheses.choice import extended
+from rt_torchrl.steps.hypotheses.ensemble import extended
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import code, parallel
 from rt_torchrl.trajectories.rollout import Rollout

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Input, Inputs, Memory, Starts, State
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines import Native
+from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import RememberingInterval
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost

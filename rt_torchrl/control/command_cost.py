@@ -25,9 +25,9 @@ from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Inputs, Starts
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.code import Group, IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import require_double
 
 TerminalCost = Callable[[Tensor], Tensor]

@@ -19,8 +19,7 @@ from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings,
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
 from rt_torchrl.steps.config import Role
-from rt_torchrl.steps.hypotheses.choice import make_twin
-from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -13,7 +13,8 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
 

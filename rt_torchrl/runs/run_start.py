@@ -21,8 +21,7 @@ from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, RunConfig
 from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.steps.config import ROLES, Role
-from rt_torchrl.steps.hypotheses.choice import make_twin
-from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -10,7 +10,6 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -122,6 +121,8 @@ def snapshot_of(run: "LoadedRun", flown: Trajectory | None) -> Snapshot:
     replay = run.twin.replayed(read)
     process, signals = None, run.physics.acting_inputs
     if run.config.twinning.arm != "model_free" and signals:
+        from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
+
         acted = read.exogenous[:, : len(signals)]
         process = ExogenousProcess(acted, dt=run.physics.dt, signals=signals, config=run.config.twinning.exogenous)
     return Snapshot(

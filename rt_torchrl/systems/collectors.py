@@ -21,9 +21,9 @@ from rt_torchrl.plants.plant import Plant, with_memories
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
-from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.code import require_pure_policy
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import Remembering, RememberingInterval, StateFeedback
 

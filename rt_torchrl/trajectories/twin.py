@@ -22,8 +22,8 @@ from torch.nn import functional
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
-from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
+from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.engines.parallel import over_all
 from rt_torchrl.trajectories.rollout import Engine, Rollout, able, drive_of, require_double
 from rt_torchrl.trajectories.state_feedback import StateFeedback

@@ -8,12 +8,13 @@ import torch
 
 from rt_torchrl.fit.least_squares import SHORT
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.assimilate import Assimilation, SensorAssimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.hypotheses.fit import Fit, Turns, misfit
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
@@ -181,3 +182,29 @@ def evidence(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, f
     }
     greatest = max(weights.values())
     return {name: weight / greatest for name, weight in weights.items()}
+
+
+def make_assimilation(
+    twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig, *, always: bool = False
+) -> Assimilation:
+    """Step 4 for a twin, or for an ensemble of them.
+
+    Args:
+        twin: the twin.
+        config: parameters of step 4.
+        hypotheses: parameters of the hypotheses.
+        always: whether the twin alone is fitted in every episode; see :class:`EnsembleAssimilation`.
+
+    Raises:
+        ValueError: if hypotheses are to be fitted to some sensors alone, or the plant has no such sensor.
+    """
+    if config.sensors and isinstance(twin, TwinEnsemble):
+        raise ValueError(
+            f"sensors={config.sensors} of the assimilation do not go with hypotheses, which replay "
+            "the whole state; leave the sensors out, or the hypotheses by hypotheses.which='none'."
+        )
+    if config.sensors:
+        return SensorAssimilation(twin, config)
+    if isinstance(twin, TwinEnsemble):
+        return EnsembleAssimilation(twin, config, hypotheses, always=always)
+    return Assimilation(twin, config)

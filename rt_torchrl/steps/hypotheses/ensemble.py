@@ -1,5 +1,6 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.trajectories.rollout import Engine, able
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -153,3 +155,53 @@ class TwinEnsemble(DigitalTwin):
         each = torch.stack([twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins])
         shares, worst = each.new_tensor(list(self._shares.values())), each[each.detach().mean(1).argmax()]
         return (1.0 - self.risk) * (shares @ each) + self.risk * worst
+
+
+def make_twin(
+    plant: Plant,
+    closure: nn.Module,
+    config: HypothesesConfig,
+    *,
+    engine: Engine = "native",
+    compiled: bool = False,
+) -> DigitalTwin:
+    """The twin of a plant, with the hypotheses and the risk that a configuration asks for.
+
+    Each hypothesis begins with a copy of the closure.
+
+    A configuration that names none takes all suspects of the plant; one that names some may name further ones, too.
+
+    Raises:
+        ValueError: if the plant suspects nothing of a name that the configuration lists.
+    """
+    suspects = plant.suspects() if config.which == "automatic" else {}
+    if config.names:
+        suspects = {**suspects, **plant.further_suspects()}
+    unknown = [name for name in config.names if name not in suspects]
+    if unknown:
+        raise ValueError(
+            f"hypotheses.names: plant {plant.name!r} does not suspect {quoted(unknown)}; choose among "
+            f"{quoted(suspects) or '(nothing)'}, or give a TwinEnsemble of your own."
+        )
+    taken = {name: suspect for name, suspect in suspects.items() if not config.names or name in config.names}
+    if not taken:
+        return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
+    device = next((w.device for w in closure.parameters()), torch.device("cpu"))
+    closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
+    twin = TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
+    twin.risk = config.risk
+    return twin
+
+
+def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
+    """A closure of the twin with the parameters of a suspect beside it.
+
+    Raises:
+        ValueError: if the suspect is no :class:`Extension`, so that nobody knows what its closure is.
+    """
+    if not isinstance(suspect, Extension):
+        raise ValueError(
+            f"suspect {type(suspect).__name__} of plant {suspect.name!r} is no Extension; give a TwinEnsemble with its "
+            "closure instead."
+        )
+    return suspect.extended(closure)

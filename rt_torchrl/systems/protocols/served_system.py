@@ -16,7 +16,8 @@ from rt_torchrl.systems.protocols.opc_ua import OpcUaLink, own_nodes
 from rt_torchrl.systems.protocols.tags import ANSWERED, SAMPLE, Tags
 from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_config import SafetyConfig
 
 Protocol = Literal["opcua", "modbus"]
 ANSWER = 0.8
