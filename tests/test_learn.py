@@ -147,6 +147,31 @@ def test_a_policy_that_cannot_be_traced_learns_by_torchrl_itself_and_a_notice_sa
     assert report["value"].isfinite() and not torch.equal(found.policy.gain, before)
 
 
+class Scheduled(LinearGain):
+    """A law with a factor beside its weights."""
+
+    def __init__(self, gain):
+        super().__init__(gain)
+        self.factor = 1.0
+
+    def forward(self, observation):
+        return self.factor * super().forward(observation)
+
+
+def test_a_setting_of_the_policy_that_changes_is_read_anew():
+    """With the factor zero no action depends on the gain, which then rests."""
+    config = LearnerConfig(critic_iterations=2, actor_iterations=2)
+    found = ActorCritic(PLANT, Scheduled([[0.2, 0.1]]), config, generator=seeded())
+    found.store(explored(20))
+    gains = [found.policy.gain.detach().clone()]
+    for factor in (1.0, 0.0):
+        found.policy.factor = factor
+        found.restart()
+        found.update()
+        gains.append(found.policy.gain.detach().clone())
+    assert not torch.equal(gains[0], gains[1]) and torch.equal(gains[1], gains[2])
+
+
 def test_a_loss_of_ones_own():
     class Doubled(DDPGLoss):
         def loss_value(self, tensordict):

@@ -35,7 +35,7 @@ from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
-from rt_torchrl.steps.report import Step, findings, merged, weight_change, weight_vector
+from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
 from rt_torchrl.systems.refusal import finite_errors, finite_transitions
 
 
@@ -262,6 +262,7 @@ class ActorCritic:
         self.actor_adam = Adam([w for name, w in named if "value_network" not in name], config.actor_rate)
         self._returns = MultiStep(config.discount, config.return_steps)
         self._iterations: dict[tuple[Any, ...], Iteration] = {}
+        self._traced = copy.deepcopy(policy)
 
     @property
     def shortest(self) -> int:
@@ -334,6 +335,9 @@ class ActorCritic:
             Means of ``critic_loss``, ``td_error``, ``value`` and both gradient norms over the iterations; the first
             three are for the rewards without ``reward_scale``. Of an update that is taken back, the ``reason`` instead.
         """
+        if not same_architecture(self._traced, self.policy):  # a graph has read the policy's settings once
+            self._iterations.clear()
+            self._traced = copy.deepcopy(self.policy)
         parts = {name: getattr(self, name) for name in UPDATED}
         before = copy.deepcopy({name: part.state_dict() for name, part in parts.items()})
         threads = torch.get_num_threads()
