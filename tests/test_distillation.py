@@ -9,7 +9,7 @@ from test_algorithm import STEPS, flown, twinning, weights
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation, ShareOfRange, match_actions
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import same_architecture
@@ -37,7 +37,9 @@ def draw(count=5, seed=2):
 
 
 def imitation():
-    virtual = VirtualEpisodes(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), None, 1, generator=seeded(0))
+    virtual = VirtualEpisodes(
+        DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), ExogenousConfig(), 1, generator=seeded(0)
+    )
     return Imitation(Belief({}, virtual), 5)
 
 

@@ -14,6 +14,7 @@ from rt_torchrl import DigitalTwin, PlannerConfig, RefereeConfig, ShortHorizonCo
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.optimisers.descent import Descended, DescentConfig, stuck
 from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes, extreme_states
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -189,7 +190,7 @@ def test_a_plan_that_is_stuck_is_made_from_other_weights_too(limit, led_back):
     config = PlannerConfig(
         iterations=40, episode_gradient_limit=limit, descent=DescentConfig(optimiser="lbfgs", rate=1.0)
     )
-    virtual = VirtualEpisodes(twin, None, 1, generator=torch.Generator().manual_seed(0))
+    virtual = VirtualEpisodes(twin, ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0))
     belief = Belief({"model_based": policy}, virtual)
     planning = MultiStart(WholeEpisodes(twin, policy, config), belief, config, lambda _: LinearGain([[-1.0, -1.0]]))
     report = planning.plan(3, EPISODES, EPISODES)
@@ -223,7 +224,7 @@ class Trapped(VirtualEpisodes):
     def __init__(self, extremes=1000):
         plant = LinearQuadratic(horizon=2.0)
         twin = DigitalTwin(plant, plant.closure)
-        super().__init__(twin, None, 1, extremes=extremes, generator=torch.Generator().manual_seed(0))
+        super().__init__(twin, ExogenousConfig(), 1, extremes=extremes, generator=torch.Generator().manual_seed(0))
 
     def cost(self, policy, episodes):
         gain = policy.gain.detach().sum().item()
@@ -253,13 +254,13 @@ def test_a_plan_that_fails_from_extreme_starts_is_made_again_with_them(wary, ext
     assert policy.gain.tolist() == [[kept, kept]] and report["plan_accepted"] == float(kept != 1.0)
 
 
-def test_episodes_from_extreme_starts_have_the_inputs_of_others_and_count_a_hundredth():
+def test_episodes_from_extreme_starts_have_the_inputs_of_others_and_count_where_they_fail():
     virtual, policy = Trapped(), LinearGain([[0.5, 0.0]])
     inputs = torch.arange(3.0).double().reshape(3, 1, 1)
     beside = virtual.with_extremes(Scenario(torch.zeros(3, 2).double(), inputs))
     assert beside.exogenous.flatten().tolist() == [0.0, 1.0, 2.0, 0.0, 1.0, 2.0, 0.0]
     assert torch.equal(beside.initial_state[3:], virtual.extremes)
-    assert virtual.judge(policy, EPISODES) == (0.99 * 0.5 + 0.01 * 1000.0, 0.5)
+    assert virtual.judge(policy, EPISODES) == (0.5 + 0.01 * (1000.0 - 5.0), 0.5)
 
 
 @pytest.mark.parametrize(("dear", "imitates_there"), [(False, False), (True, True)])

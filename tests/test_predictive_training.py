@@ -22,7 +22,7 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig, ShortHorizonConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import make_planner
@@ -126,7 +126,7 @@ def test_a_clone_learns_the_actions_of_record_and_flights():
     draw = lambda: Scenario(0.5 * plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator))  # noqa: E731
     record = teacher.fly(*draw())
     one = record._replace(**{name: getattr(record, name)[0] for name in ("states", "actions", "exogenous")})
-    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), None, 1, generator=generator)
+    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), ExogenousConfig(), 1, generator=generator)
     error = Imitation(Belief({}, virtual), 2).imitate(teacher, student, seen=one, draw=draw)
     unseen = teacher.fly(*draw())
     imitated = student(plant.observe(torch.zeros(()), unseen.states[:, :-1], unseen.exogenous))

@@ -235,8 +235,8 @@ def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "s
 
 EXTREMES_SEED = 3_000_000
 """Seed of the initial states among which the extreme ones are found: the same for every training."""
-RARE = 0.01
-"""Share of all episodes that begin like the extreme ones, by which their cost counts."""
+RARE, FAILURE = 0.01, 10.0
+"""Share of all episodes that begin like the extreme ones, and how many times the usual cost they may cost there."""
 
 
 def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tensor, "k n_s"]:
@@ -358,15 +358,17 @@ class VirtualEpisodes:
         return self.constraints.priced(flown.states.new_full((len(flown.states),), cost), flown).mean().item()
 
     def judge(self, policy: nn.Module, episodes: Scenario) -> tuple[float, float]:
-        """The cost by which policies are compared, where one episode in a hundred is an extreme one; and the price.
+        """The cost by which policies are compared, which counts failures in extreme episodes; and the price.
 
-        Extreme episodes begin with the extremes of each state, under the inputs of the others in turn. State feedback
-        is asked for its price alone, because model predictive control takes too long in further episodes.
+        Extreme episodes begin with the extremes of each state, under the inputs of the others in turn. What they cost
+        beyond ten times the price counts as if one episode in a hundred were one. State feedback is asked for its price
+        alone, because model predictive control takes too long in further episodes.
         """
         price = self.price(policy, episodes)
         if not len(self.extremes) or isinstance(policy, StateFeedback):
             return price, price
-        return (1.0 - RARE) * price + RARE * self.price(policy, self._extreme(episodes)), price
+        beyond = self.price(policy, self._extreme(episodes)) - FAILURE * abs(price)
+        return price + RARE * max(0.0, beyond) if math.isfinite(price) else price, price
 
     def with_extremes(self, episodes: Scenario) -> Scenario:
         """Some episodes, and the extreme ones under their inputs, if there are some."""

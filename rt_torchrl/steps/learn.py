@@ -756,6 +756,7 @@ class LeastPriorityWriter(Writer):
         """Read nothing; see :meth:`load_state_dict`."""
 
 
+@runtime_checkable
 class MakeLearner(Protocol):
     """A function that makes the learner of step 2; :class:`ActorCritic` describes the arguments."""
 
