@@ -108,16 +108,16 @@ PRESSED = """
 import os, signal
 from unittest.mock import patch
 from small_recipe import Config, main as train
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.steps.interact import Interact
 
-INTERACT = ReinforcementTwinning.interact
+FORWARD = Interact.forward
 
-def pressed(algorithm):
+def pressed(step, episode):
     os.kill(os.getpid(), signal.SIGNAL)
-    return INTERACT(algorithm)
+    return FORWARD(step, episode)
 
 def main(config):
-    with patch.object(ReinforcementTwinning, "interact", pressed):
+    with patch.object(Interact, "forward", pressed):
         train(config)
 """
 """A recipe that is interrupted in its first episode."""
