@@ -91,7 +91,7 @@ def test_the_expected_cost_is_that_of_a_gaussian_process():
     at = np.array([2.01, 2.0, 2.03, 5.0])
     distances = np.abs(at[:, None] - at[None]) * positions / 2.0  # in shares of half the range, ±2
     likelihoods = []
-    for amplitude in np.linspace(0.1, 2.0, 400):
+    for amplitude in np.linspace(0.02, 2.0, 400):
         k = amplitude**2 * (COMMON + (1.0 - COMMON) * np.exp(-0.5 * (distances[1:, 1:] / LENGTH) ** 2))
         k += NOISE**2 * np.eye(3)
         d = np.array([0.9, 0.8, 0.0])
