@@ -82,9 +82,9 @@ def results_table(metrics: dict[str, Any]) -> str:
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
     lines.append(
-        f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes{judging}, largest {most}"
+        f"  live at the end: {found['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
+        f"{paid['episodes']} episodes{judging}, largest {most}"
     )
-    lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(found.get("twin"))
