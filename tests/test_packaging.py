@@ -337,7 +337,7 @@ for path in recipes:
     try:
         runpy.run_path(path, run_name="__main__")
     except Done:
-        late = ("matplotlib", "onnx", "jax", "casadi", "gymnasium", "torch._inductor.compile_fx", "torchrl.collectors")
+        late = ("matplotlib", "onnx", "jax", "casadi", "gymnasium", "torch._inductor.compile_fx")
         print("late:", [name for name in late if name in sys.modules], flush=True)
 """
 

@@ -292,7 +292,7 @@ def flown(flights: Sequence[Flight], dt: float) -> TensorDict:
                 "states": record.states,
                 "actions": record.actions,
                 "exogenous": record.exogenous,
-                "start": torch.as_tensor(record.start, dtype=torch.float64),
+                "start": torch.as_tensor(record.start, dtype=torch.float64, device=record.states.device),
             },
             "transitions": {str(number): part for number, part in enumerate(parts)},
         }
