@@ -130,7 +130,7 @@ def test_an_interrupt_loses_nothing_but_the_episode_under_way(tmp_path, trained,
 @pytest.mark.slow
 def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_path, trained):
     whole, seconds = trained
-    moments = [1.0 - (1.0 - k / 10) ** 2 for k in range(10)]  # a training traces its learner in the first episode
+    moments = [1.0 - (1.0 - k / 20) ** 2 for k in range(20)]  # a training traces its learner in the first episode
     done = {require_nothing_lost(tmp_path / str(share), whole, max(share * seconds, 1e-3)) for share in moments}
     # The moments were of all kinds: before the first episode, between any two, and after the last.
     assert len(done & set(range(1, EPISODES + 1))) >= 3
