@@ -9,6 +9,7 @@ the steps:
 | ``number`` | number of the episode, from 0 | the algorithm | 1, 5 |
 | ``live`` | role of the policy that acts | the algorithm, 1 | 1 |
 | ``record/states``, ``actions``, ``exogenous``, ``start`` | n+1 × n_s, n × n_a, n × n_z, [s] | 1 | 3, 4, 6 |
+| ``record/whole``, ``record/ended`` | whether it is that of a whole episode, and whether this ended early | 1 | 3 |
 | ``transitions/k`` | n_k transitions of each sound part | 1 | 2 |
 | ``real_cost`` | J_a as measured | 1 | |
 | ``weight_changes/model_free``, ``/model_based`` | relative change ‖Δw‖/‖w‖ | 2, 5 | 6 |
@@ -46,7 +47,7 @@ from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, Operating
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
-from rt_torchrl.steps.report import EpisodeReport, findings, merged, on_device
+from rt_torchrl.steps.report import EpisodeReport, episode_report, findings, merged, on_device
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
@@ -158,7 +159,7 @@ class ReinforcementTwinning(TensorDictSequential):
         steps: dict[str, TensorDictModuleBase] = {
             "interact": interact,
             "learn": Learn(learner, belief, judged),
-            "inputs": FitInputs(virtual, flights),
+            "inputs": FitInputs(virtual),
             "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
             "plan": MakePlan(planning, count, judged),
             "switch": Switch(referee, policies, belief, imitation, halves, learner.observations, judged),
@@ -217,13 +218,14 @@ class ReinforcementTwinning(TensorDictSequential):
             tell: function that is called with the name of every step when the step begins.
 
         Returns:
-            ``real_cost``, ``live``, what the steps of this arm report, and the ``seconds`` of each step.
+            ``real_cost``, ``live``, all numbers and texts that the steps of this arm have set, and the ``seconds`` of
+            each step.
         """
         flown = self(TensorDict({"number": self.episodes_done}), tell=tell)
         self.episodes_done += 1
         if self.operating:
             self.operating.hand_over(self.referee.live, self.episodes_done)
-        return EpisodeReport(flown.exclude("number", "record", "transitions", "large_scale", "weight_changes"))
+        return episode_report(flown)
 
     def forward(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda step: None) -> TensorDictBase:
         """Let an episode flow through the steps, after the start before the first one; see :meth:`episode`."""

@@ -6,6 +6,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from printed_commands import documented
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
@@ -13,6 +14,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.report import plain
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -285,6 +287,23 @@ def test_a_step_of_ones_own_flows_with_the_others():
     assert report["residual"] < 1e-9 and list(report["seconds"].keys()) == [*STEPS[:4], "residual", *STEPS[4:]]
     with pytest.raises(ValueError, match="before='planning' is no step of this arm; choose one of interact, learn"):
         found.insert("other", found.module["plan"], before="planning")
+
+
+class Curvature(TensorDictModuleBase):
+    """A step that sets one value per state."""
+
+    in_keys, out_keys = [("record", "states")], ["curvature"]
+
+    def forward(self, episode):
+        return episode.set("curvature", episode["record", "states"].diff(n=2, dim=0).abs().amax(0))
+
+
+def test_a_vector_that_a_step_sets_is_data_and_no_entry_of_the_report():
+    found = twinning()
+    found.insert("curvature", Curvature(), before="plan")
+    report = found.episode()
+    assert "curvature" in report["seconds"].keys() and "curvature" not in report.keys()  # noqa: SIM118
+    assert plain(report.exclude("seconds"))["real_cost"] == report["real_cost"]
 
 
 def test_keys_flow_as_the_steps_declare():

@@ -130,7 +130,7 @@ def test_what_is_refused_raises_no_multiplier():
         steps, stays = judged(planner), planner.policy.gain.clone()
         planner.config = dataclasses.replace(planner.config, iterations=iterations)
         wild = [{"gain": torch.full((1, 2), gain, dtype=torch.float64)} for gain in others]
-        steps._others, steps.count = lambda *arguments, wild=wild: iter(wild), len(wild)
+        steps._others, steps.count = lambda *arguments, wild=wild: iter([(1, weights) for weights in wild]), len(wild)
         dearer = iter([1.0, *[2.0] * 3])  # than what stays
         steps.belief.judge = lambda policy, on, dearer=dearer: Judged(cost := next(dearer), cost)
         steps.plan(1, episodes, episodes)

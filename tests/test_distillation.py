@@ -1,5 +1,6 @@
 """A clone between two architectures, on the linear-quadratic plant."""
 
+import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
@@ -176,4 +177,6 @@ def test_a_copy_of_weights_is_no_clone_of_another_activation():
             self.factor, self.layer = factor, torch.nn.Linear(2, 1)
 
     assert same_architecture(Scaled(1.0), Scaled(1.0)) and not same_architecture(Scaled(1.0), Scaled(2.0))
+    ones, twos = np.ones(2), np.full(2, 2.0)
+    assert same_architecture(Scaled(ones), Scaled(ones.copy())) and not same_architecture(Scaled(ones), Scaled(twos))
     assert not same_architecture(affine([-0.8, -1.1]), perceptron())

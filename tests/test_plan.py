@@ -106,8 +106,8 @@ def test_weights_before_an_imitation_are_a_start_until_the_end():
     assert said(policy) == 3.0
     again = multi_start(policy, belief_of())
     again.load_state_dict(copy.deepcopy(planning.state_dict()))
-    again.plan(4, EPISODES, EPISODES)
-    assert said(policy) == 2.5
+    report = again.plan(4, EPISODES, EPISODES)
+    assert said(policy) == 2.5 and report["start"] == 2.0
 
 
 def test_the_cheapest_of_all_random_policies_is_a_start(monkeypatch):
@@ -143,7 +143,7 @@ def test_policies_of_another_architecture_are_refused():
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
 def test_starts_that_find_nothing_change_no_training(optimiser, monkeypatch):
     """Nor do they change what the next plan depends on: random numbers, and moments of Adam."""
-    monkeypatch.setattr(MultiStart, "_others", lambda *arguments: iter([gains(-50.0)]))
+    monkeypatch.setattr(MultiStart, "_others", lambda *arguments: iter([(1, gains(-50.0))]))
     descent = DescentConfig(optimiser=optimiser, rate=0.01 if optimiser == "adam" else 1.0)
     planners = (PlannerConfig(iterations=5, descent=descent, starts=count) for count in (0, 4))
     found = [twinning(arm="model_based", planner=planner) for planner in planners]

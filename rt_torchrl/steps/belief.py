@@ -245,7 +245,11 @@ class Belief:
 
     def best_flown(self, like: nn.Module, episodes: Scenario) -> tuple[dict[str, Tensor], Judged] | None:
         """The weights that are expected to cost least of all that have flown in an architecture; None if none has."""
-        flown = [policy for policy in map(self.policy_of, self.flown) if same_architecture(policy, like)]
+        different: list[Flown] = []
+        for one in self.flown:
+            if not any(equal(one.weights, other.weights) for other in different):
+                different.append(one)
+        flown = [policy for policy in map(self.policy_of, different) if same_architecture(policy, like)]
         if not flown:
             return None
         costs = [self.judge(policy, episodes) for policy in flown]
@@ -306,7 +310,7 @@ def wrong(differences: Sequence[float]) -> str:
 
 
 def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether two states of a twin are the same."""
+    """Whether two states, of a twin or of a policy, are the same."""
     (one, structure), (two, its_structure) = tree_flatten(state), tree_flatten(other)
     return structure == its_structure and all(
         torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(one, two, strict=True)

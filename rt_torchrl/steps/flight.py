@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -116,6 +117,33 @@ def together(flights: Sequence[Flight]) -> TensorDict:
     if not all(flight.whole for flight in flights):
         report.update(findings(sound_intervals=float(sum(flight.sound_intervals for flight in flights))))
     return report
+
+
+def flown(flights: Sequence[Flight], dt: float) -> TensorDict:
+    """The record of the last of some flights, and the transitions of all their sound parts."""
+    last = flights[-1]
+    record = last.record
+    flag = partial(torch.tensor, device=record.states.device)
+    parts = [part for flight in flights for part in flight.parts(dt)]
+    return TensorDict(
+        {
+            "record": {
+                "states": record.states,
+                "actions": record.actions,
+                "exogenous": record.exogenous,
+                "start": torch.as_tensor(record.start, dtype=torch.float64, device=record.states.device),
+                "whole": flag(last.whole),
+                "ended": flag(last.ended),
+            },
+            "transitions": {str(number): part for number, part in enumerate(parts)},
+        }
+    )
+
+
+def record_of(episode: TensorDictBase) -> Trajectory:
+    """The record of an episode as a trajectory."""
+    record = episode["record"]
+    return Trajectory(record["states"], record["actions"], record["exogenous"], float(record["start"]))
 
 
 class RealFlights:

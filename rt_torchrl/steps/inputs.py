@@ -20,7 +20,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.constraints import Constraints
-from rt_torchrl.steps.flight import Flight, RealFlights
+from rt_torchrl.steps.flight import record_of
 from rt_torchrl.steps.report import Step
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -289,13 +289,6 @@ class VirtualEpisodes:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
         self.processes.append(self._process(record))
 
-    def learn_flight(self, flight: Flight | None) -> None:
-        """The same of a flight, if it is whole; inputs of one that ended early are continued to the horizon."""
-        if flight is None or not flight.whole:
-            return
-        record, n = flight.record, self.twin.plant.n_steps
-        self.learn(record._replace(exogenous=continued(record.exogenous, n)) if flight.ended else record)
-
     def repeated(self, record: Trajectory) -> Scenario:
         """The start and the inputs of a real episode, which are continued to the horizon if it ended early."""
         plant = self.twin.plant
@@ -391,22 +384,26 @@ class VirtualEpisodes:
 
 
 class FitInputs(Step):
-    """Step 3: fit a Gaussian process to the exogenous input of the episode, if it is whole.
+    """Step 3: fit a Gaussian process to the exogenous input of the episode, if its record is whole.
 
-    Reads ``record``. Writes ``large_scale``, the large scale d̃ of the inputs that act, n × n_z, of the last process.
+    Reads ``record``; inputs of one that ended early are continued to the horizon. Writes ``large_scale``, the large
+    scale d̃ of the inputs that act, n × n_z, of the last process.
 
     Args:
         virtual: virtual episodes, which keep the processes.
-        flights: real episodes, of which the latest says whether it is whole.
     """
 
     in_keys = ["record"]
     out_keys = ["large_scale"]
 
-    def __init__(self, virtual: VirtualEpisodes, flights: RealFlights):
+    def __init__(self, virtual: VirtualEpisodes):
         super().__init__(virtual=virtual)
-        self.virtual, self.flights = virtual, flights
+        self.virtual = virtual
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        self.virtual.learn_flight(self.flights.latest)
+        record, n = record_of(episode), self.virtual.twin.plant.n_steps
+        if episode["record", "ended"]:
+            record = record._replace(exogenous=continued(record.exogenous, n))
+        if episode["record", "whole"]:
+            self.virtual.learn(record)
         return episode.set("large_scale", self.virtual.processes[-1].mean)

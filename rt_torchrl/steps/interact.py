@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
-from rt_torchrl.steps.flight import Flight, RealFlights, ShortTermMemory, together
+from rt_torchrl.steps.flight import Flight, RealFlights, ShortTermMemory, flown, together
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import Step, as_findings, findings, merged, plain
 from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
@@ -115,23 +115,6 @@ class Clearance:
         self._last = None if last is None else (last["role"], last["weights"])
 
 
-@runtime_checkable
-class Trainer(Protocol):
-    """What :class:`Operating` needs of the algorithm."""
-
-    policies: dict[Role, nn.Module]
-    clearance: Clearance
-    flights: RealFlights
-    config: TwinningConfig
-    belief: Belief
-    short_term: ShortTermMemory
-    judged: int
-
-    @property
-    def virtual(self) -> VirtualEpisodes:
-        """Virtual episodes of the twin."""
-
-
 class Operating:
     """Takes the windows of an operation, and hands policies over.
 
@@ -140,16 +123,16 @@ class Operating:
 
     Args:
         operation: the real system in operation.
-        trainer: the algorithm.
+        step: step 1, with what it shares with the other steps.
     """
 
-    def __init__(self, operation: Operation, trainer: Trainer):
-        self.operation, self.trainer, self._exploration = operation, trainer, trainer.config.exploration
+    def __init__(self, operation: Operation, step: "Interact"):
+        self.operation, self.step, self._exploration = operation, step, step.config.exploration
 
     def fly_first(self, teacher: nn.Module) -> Flight:
         """One window under what the training begins with, which then acts on until the first policy takes over."""
         self.operation.hand_over(FIRST, teacher, strength=0.0)
-        return self.trainer.flights.fly_first(teacher)
+        return self.step.flights.fly_first(teacher)
 
     def hand_over(self, role: Role, episode: int) -> None:
         """Hand over the policy that acts now, or another one if the twin predicts that it would leave the limits.
@@ -158,7 +141,7 @@ class Operating:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
+        policy, role, report = self.step.clearance.choose(role, self.step.judged)
         strength = self._exploration.strength(episode)
         self.operation.hand_over(role, policy, strength=strength, found=plain(report))
 
@@ -177,10 +160,10 @@ class Operating:
             self.hand_over(live, 0)
         flights, policy_flew = list[Flight](), False
         while not policy_flew or self.operation.waiting():
-            if flights and flights[-1].whole and self.trainer.config.arm != "model_free":
-                self.trainer.virtual.learn(flights[-1].record)  # step 3 fits the last one
+            if flights and flights[-1].whole and self.step.config.arm != "model_free":
+                self.step.virtual.learn(flights[-1].record)  # step 3 fits the last one
             flight = self._taken()
-            self.trainer.short_term.append(flight.record)
+            self.step.short_term.append(flight.record)
             flights.append(flight)
             order = self._order_of(flight)
             if order.name != FIRST:
@@ -189,8 +172,8 @@ class Operating:
         return flights, self._report(flights)
 
     def _taken(self) -> Flight:
-        needed = self.trainer.virtual.wanting(self.trainer.config.arm)
-        return self.trainer.flights.fly(self.trainer.policies["model_free"], strength=0.0, whole=needed)
+        needed = self.step.virtual.wanting(self.step.config.arm)
+        return self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=needed)
 
     def _order_of(self, flight: Flight) -> Order:
         versions = flight.transitions["version"].flatten()
@@ -202,7 +185,7 @@ class Operating:
             return  # costs of parts cannot be compared with those of windows
         role, cost = cast(Role, order.name), flight.cost.item()
         explored = order.strength * self._exploration.spread
-        self.trainer.belief.append(flight.record, role, cost, explored, order.weights)
+        self.step.belief.append(flight.record, role, cost, explored, order.weights)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])
@@ -210,7 +193,7 @@ class Operating:
         report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
         merged(report, as_findings(order.found or {})).update(findings(**(self.operation.acted or {})))
-        counted = [self.trainer.clearance.counted(flight.record) for flight in flights]
+        counted = [self.step.clearance.counted(flight.record) for flight in flights]
         kinds = counted[0].keys()
         report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
         late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
@@ -224,8 +207,9 @@ class Interact(Step):
     """Step 1: the live policy flies one episode on the real system, or acts in a window of one that operates on.
 
     Reads ``number``, that of the episode from 0, and ``live``, the role that acts. Writes ``record``, the trajectory of
-    the sound part (``states`` n+1 × n_s, ``actions`` n × n_a, ``exogenous`` n × n_z, ``start`` [s]), ``transitions``
-    of all sound parts, by number, as TorchRL's collectors give them, and ``real_cost``, J_a as measured.
+    the sound part (``states`` n+1 × n_s, ``actions`` n × n_a, ``exogenous`` n × n_z, ``start`` [s]; whether it is that
+    of a ``whole`` episode, and whether this ``ended`` early), ``transitions`` of all sound parts, by number, as
+    TorchRL's collectors give them, and ``real_cost``, J_a as measured.
 
     Args:
         env: the real system, or an operation of one.
@@ -250,9 +234,10 @@ class Interact(Step):
         config: TwinningConfig,
         judged: int,
     ):
-        self.short_term = ShortTermMemory(config.records)
-        super().__init__(env=env, clearance=clearance, short_term=self.short_term)
-        self.policies, self.flights, self.clearance, self.belief = policies, flights, clearance, belief
+        short_term = ShortTermMemory(config.records)
+        super().__init__(env=env, clearance=clearance, short_term=short_term)
+        self.short_term, self.policies, self.flights = short_term, policies, flights
+        self.clearance, self.belief = clearance, belief
         self.config, self.judged = config, judged
         self.operating = Operating(env, self) if isinstance(env, Operation) else None
 
@@ -280,26 +265,3 @@ class Interact(Step):
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
         return [flight], report.set_non_tensor("live", cleared.role)
-
-
-def flown(flights: Sequence[Flight], dt: float) -> TensorDict:
-    """The record of the last of some flights, and the transitions of all their sound parts."""
-    record = flights[-1].record
-    parts = [part for flight in flights for part in flight.parts(dt)]
-    return TensorDict(
-        {
-            "record": {
-                "states": record.states,
-                "actions": record.actions,
-                "exogenous": record.exogenous,
-                "start": torch.as_tensor(record.start, dtype=torch.float64, device=record.states.device),
-            },
-            "transitions": {str(number): part for number, part in enumerate(parts)},
-        }
-    )
-
-
-def record_of(episode: TensorDictBase) -> Trajectory:
-    """The record of an episode as a trajectory."""
-    record = episode["record"]
-    return Trajectory(record["states"], record["actions"], record["exogenous"], float(record["start"]))

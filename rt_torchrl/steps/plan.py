@@ -17,6 +17,7 @@ from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
+from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -176,8 +177,6 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
         ValueError: if the method is receding_horizon and the policy is not :class:`PredictiveControl`, or the other way
             round.
     """
-    from rt_torchrl.steps.short_horizon import ShortHorizon  # which needs the parameters above
-
     if isinstance(policy, PredictiveControl):
         if config.method == "receding_horizon":
             return RecedingHorizonPlanner(twin, policy, config)
@@ -276,7 +275,7 @@ class MultiStart:
         flown = self.belief.best_flown(policy, judged_on) if several or self._refuted else None
         if several:
             others = self._others(episode, planned_on, flown)
-            new = (weights for weights in others if not equal(weights, present))
+            new = ((number, weights) for number, weights in others if not equal(weights, present))
             best = self._best(best, new, planned_on, judged_on)
         if flown is not None and self._refuted and flown[1] < best.cost:
             best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
@@ -289,10 +288,12 @@ class MultiStart:
         """Whether a policy that has flown may be better than all that the twin plans."""
         return self.count > 0 and self.belief.corrects and self.belief.contradicted
 
-    def _best(self, best: Plan, others: Iterable[Weights], planned_on: Scenario, judged_on: Scenario) -> Plan:
+    def _best(
+        self, best: Plan, others: Iterable[tuple[int, Weights]], planned_on: Scenario, judged_on: Scenario
+    ) -> Plan:
         """The best of a plan and of those from other weights; the policy gets its weights."""
         after, start = copy.deepcopy(self.planner.state_dict()), 0
-        for number, weights in enumerate(others, start=1):
+        for number, weights in others:
             plan = self._from_others(weights, planned_on, judged_on)
             if plan is not None and plan.cost < best.cost:
                 best, start = plan, number
@@ -353,14 +354,16 @@ class MultiStart:
         self._stalled = self._stalled + 1 if self.planner.stalled(plan.report) else 0
         return episode.bit_count() == 1 or self._stalled.bit_count() == 1
 
-    def _others(self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None) -> Iterator[Weights]:
-        """Other weights to begin with."""
+    def _others(
+        self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None
+    ) -> Iterator[tuple[int, Weights]]:
+        """Other weights to begin with, and the number by which ``start`` reports their kind."""
         if self._first is not None:
-            yield self._first
+            yield 2, self._first
         if self.alike:
-            yield self._random(episode, planned_on)
+            yield 1, self._random(episode, planned_on)
         if flown is not None:
-            yield flown[0]
+            yield 3, flown[0]
 
     @torch.no_grad()
     def _random(self, episode: int, planned_on: Scenario) -> Weights:

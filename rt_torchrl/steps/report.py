@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -107,6 +108,13 @@ class EpisodeReport(TensorDict):
         return "\n".join(lines)
 
 
+def episode_report(episode: TensorDictBase) -> EpisodeReport:
+    """The numbers and texts of an episode, and its seconds; all else is data that flows between the steps."""
+    keys = [key for key in episode.keys() if key != "seconds" and not isinstance(episode[key], str)]  # noqa: SIM118
+    data = [key for key in keys if isinstance(episode[key], TensorDictBase) or episode[key].numel() != 1]
+    return EpisodeReport(episode.exclude("number", *data))
+
+
 def weight_vector(module: nn.Module) -> Tensor:
     """All weights of a module in one vector, detached."""
     return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
@@ -135,7 +143,7 @@ def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
 def _settings(module: nn.Module) -> dict[str, Any]:
     """Attributes that are neither weights nor submodules, such as an activation or a depth."""
     values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
-    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}
+    return {name: v.tolist() if isinstance(v, Tensor | np.ndarray) else v for name, v in values.items()}
 
 
 def on_device(state: dict[str, Any], device: torch.device) -> dict[str, Any]:
