@@ -8,6 +8,7 @@ import pickle
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,17 @@ def test_a_folder_in_use_is_refused_until_it_is_let_go(tmp_path):
         RunFolder(RunConfig(log_dir=tmp_path, overwrite=True), "p")
     folder.release()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
+
+
+def test_runs_begun_within_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda *_: "20260101-000000")
+    folders = [RunFolder(RunConfig(seed=3), "p") for _ in range(3)]
+    assert [str(folder.path.relative_to("runs/p")) for folder in folders] == [
+        "20260101-000000-seed-3",
+        "20260101-000000-2-seed-3",
+        "20260101-000000-3-seed-3",
+    ]
 
 
 def test_a_killed_process_lets_its_folder_go(tmp_path):

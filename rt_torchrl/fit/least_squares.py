@@ -297,7 +297,7 @@ class Estimation:
         config: EstimationConfig | None = None,
     ):
         self.twin, self.sensors, self.config = twin, tuple(sensors), config or EstimationConfig()
-        unknown = torch.full((len(twin.plant.states),), math.inf, dtype=torch.float64)
+        unknown = torch.full((len(twin.plant.states),), math.inf, dtype=torch.float64, device="cpu")  # moved to records
         self.spread = unknown if spread is None else spread
         names = ", ".join(state.name for state in twin.plant.states)
         if self.spread.shape != unknown.shape or not (self.spread >= 0.0).all():

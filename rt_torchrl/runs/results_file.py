@@ -27,18 +27,19 @@ def make_folder(option: str, folder: Path) -> None:
         raise ValueError(f"{option}={folder} cannot be written; choose another folder.")
 
 
-def new_folder(parent: Path) -> Path:
+def new_folder(parent: Path, ending: str = "") -> Path:
     """Make a folder with the present time in its name, which no other process has made.
 
     Args:
         parent: folder in which it is made; it need not exist.
+        ending: what its name ends with.
 
     Raises:
         OSError: if the folder cannot be made.
     """
     stamp, number = time.strftime("%Y%m%d-%H%M%S"), 1
     while True:
-        folder = parent / (stamp if number == 1 else f"{stamp}-{number}")
+        folder = parent / f"{stamp if number == 1 else f'{stamp}-{number}'}{ending}"
         try:
             folder.mkdir(parents=True)
         except FileExistsError:  # of the same second

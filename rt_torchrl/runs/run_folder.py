@@ -1,13 +1,13 @@
 """The folder of one run, in which one training at a time writes and an earlier run may have left files."""
 
 import os
-import time
 from pathlib import Path
 
 import filelock
 
 from rt_torchrl.atomic_file import remove_partials
 from rt_torchrl.runs import checkpoint, run_settings
+from rt_torchrl.runs.results_file import new_folder
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import FILE
 
@@ -41,10 +41,8 @@ class RunFolder:
             raise ValueError(
                 "resume and overwrite exclude each other: one goes on with the run in log_dir, the other removes it."
             )
-        stamp = time.strftime("%Y%m%d-%H%M%S")
-        self.path = config.log_dir or Path("runs") / plant / f"{stamp}-seed-{config.seed}"
         self._config, self._plant = config, plant
-        self._require_writable()
+        self.path = self._writable()
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
         self.hold()
@@ -54,16 +52,19 @@ class RunFolder:
             self.release()
             raise
 
-    def _require_writable(self) -> None:
+    def _writable(self) -> Path:
+        parent = Path("runs") / self._plant
+        path = self._config.log_dir or parent
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            probe = self.path / f".writable-{os.getpid()}"
+            if self._config.log_dir is None:
+                path = new_folder(parent, f"-seed-{self._config.seed}")
+            path.mkdir(parents=True, exist_ok=True)
+            probe = path / f".writable-{os.getpid()}"
             probe.touch()
             probe.unlink()
         except OSError as error:
-            raise ValueError(
-                f"log_dir={self.path} cannot be written ({error}); choose another with --log-dir."
-            ) from error
+            raise ValueError(f"log_dir={path} cannot be written ({error}); choose another with --log-dir.") from error
+        return path
 
     def hold(self) -> None:
         """Keep other trainings out of the folder from now on.
