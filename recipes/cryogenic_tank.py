@@ -1,11 +1,10 @@
 """Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading
 
@@ -15,6 +14,7 @@ if __name__ == "__main__":
 from torch import nn
 
 from rt_torchrl import (
+    PAPER,
     AssimilationConfig,
     DescentConfig,
     ExogenousConfig,
@@ -25,6 +25,7 @@ from rt_torchrl import (
     PlannerConfig,
     Plant,
     PredictiveConfig,
+    Preset,
     RefereeConfig,
     RunConfig,
     TwinningConfig,
@@ -40,10 +41,22 @@ if TYPE_CHECKING:
 
     from rt_torchrl import Snapshot
 
-PAPER = TwinningConfig(
-    # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
-    # The pressure moves over days: the noise lasts a period of the load, returns span 17 h and the discount 42 h.
+# Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
+LOAD = ExogenousConfig(knots=1440)
+LBFGS = DescentConfig(optimiser="lbfgs", rate=1.0)
+PAPER_T3 = dataclasses.replace(
+    PAPER,
     realisations=1,
+    learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
+    exogenous=LOAD,
+    assimilation=AssimilationConfig(iterations=30),
+    planner=dataclasses.replace(PAPER.planner, iterations=5, descent=LBFGS),
+    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
+)
+"""Configuration of the training with ``--preset paper``: Table 1 of the paper, row T3."""
+DEFAULT = TwinningConfig(
+    realisations=1,
+    # The pressure moves over days: the noise lasts a period of the load, returns span 17 h and the discount 42 h.
     exploration=ExplorationConfig(correlation_time=5400.0),
     learner=LearnerConfig(
         critic_iterations=1000,
@@ -53,46 +66,29 @@ PAPER = TwinningConfig(
         reward_scale=1e-3,
         actor_rate=5e-4,
     ),
-    # Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
-    exogenous=ExogenousConfig(knots=1440),
+    exogenous=LOAD,
     # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
     assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
     # Starting pressures differ by 25 kPa: a plan for one of them does not suit the others.
     planner=PlannerConfig(
-        iterations=5,
+        iterations=12,
         realisations=20,
-        starts=0,
-        episode_gradient_limit=math.inf,
-        extremes=0,
-        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
+        descent=dataclasses.replace(LBFGS, tolerance=1e-6),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
         receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
     ),
-    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
-    hypotheses=HypothesesConfig(which="none"),
-)
-CONVERGED = dataclasses.replace(
-    PAPER,
-    planner=dataclasses.replace(
-        PAPER.planner,
-        iterations=12,
-        starts=32,
-        episode_gradient_limit=10.0,
-        extremes=1000,
-        descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
-    ),
-    hypotheses=HypothesesConfig(),
-    referee=dataclasses.replace(PAPER.referee, rule="expected_cost"),
+    referee=RefereeConfig(patience=4, clone_patience=20),
 )
 """Configuration of the training by default, whose plans converge."""
 NEURAL = dataclasses.replace(
-    PAPER,
+    DEFAULT,
     # Segments last two hours. Without the prior the perceptron takes the first steps, which the constants should take.
     assimilation=AssimilationConfig(
         iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
     ),
+    hypotheses=HypothesesConfig(which="none"),
 )
-"""Configuration of the training with ``--closure mlp``."""
+"""Configuration of the training with ``--preset neural``."""
 
 VALVES = {"on-off": OnOffValve, "PI": PIValve}
 """Classical controllers that the policies are compared with."""
@@ -103,8 +99,6 @@ class Config(RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
     Args:
-        paper: train as the paper does, with its random start, command, cost and numbers of gradients, as far as other
-            options do not say otherwise.
         policy: paper (a cubic of the pressure error with 3 weights; an affine law of other observations) or mlp.
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of the pressure),
             clock (this and the time of the episode), phase (this and the phase of the orbit), measured (all states),
@@ -127,7 +121,6 @@ class Config(RunConfig):
             drift_25 (of the pressure sensor), valve_lag, two_zones and all; docs/unknown_systems.md describes them.
     """
 
-    paper: bool = False
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
     start: str = "controller"
@@ -144,7 +137,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
-    twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
+    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
 
     def __post_init__(self):
         super().__post_init__()
@@ -160,15 +153,19 @@ class Config(RunConfig):
                 "no plans of a half-open valve, whose cost has many minima. Use command duty."
             )
 
-    def defaults(self) -> "Config":
-        twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
+    def presets(self) -> dict[Preset, dict[str, Any]]:
+        presets = super().presets() | {
+            "default": {"twinning": DEFAULT},
+            "paper": {"start": "random", "command": "drop", "end_weight": 0.0, "twinning": PAPER_T3},
+            "neural": {"closure": "mlp", "twinning": NEURAL},
+        }
         if self.noise:
             # An error of 0.5 % in the first reading of the pressure lasts for five days: the closure makes up for it.
-            estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
-            twinning = dataclasses.replace(twinning, assimilation=estimated)
-        if self.paper:
-            return Config(paper=True, start="random", command="drop", end_weight=0.0, twinning=twinning)
-        return Config(twinning=self.suited(twinning))
+            for preset in ("default", "neural", "mpc"):
+                twinning = presets[preset]["twinning"]
+                estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
+                presets[preset]["twinning"] = dataclasses.replace(twinning, assimilation=estimated)
+        return presets
 
     def plant(self) -> Plant:
         return unknown(self.tank(), self.unknown)

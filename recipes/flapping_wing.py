@@ -1,10 +1,9 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading
 
@@ -12,6 +11,7 @@ if __name__ == "__main__":
     begin_loading()
 
 from rt_torchrl import (
+    PAPER,
     AssimilationConfig,
     DescentConfig,
     ExogenousConfig,
@@ -22,6 +22,7 @@ from rt_torchrl import (
     PlannerConfig,
     Plant,
     PredictiveConfig,
+    Preset,
     RefereeConfig,
     RunConfig,
     TwinningConfig,
@@ -42,10 +43,23 @@ if TYPE_CHECKING:
 PREDICTIVE = PredictiveConfig(horizon=1.5, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
 """Model predictive control with ``--twinning.planner.method receding_horizon``."""
 
-PAPER = TwinningConfig(
-    # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.
+# The gust is smooth over its 3 s, and the residual of a regression would be taken for drag: with a kernel of 0.3 s and
+# a tube of 2e-4 the residual is 1e-4 m/s.
+GUST = ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3)
+PAPER_T2 = dataclasses.replace(
+    PAPER,
+    learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
+    exogenous=GUST,
+    assimilation=AssimilationConfig(stop_below=1e-2),
+    planner=dataclasses.replace(
+        PAPER.planner, iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
+    ),
+    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=4),
+)
+"""Configuration of the training with ``--preset paper``: Table 1 of the paper, row T2."""
+DEFAULT = TwinningConfig(
     # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
-    # discount one second. With the paper's 0.998 and targets of one interval the policy flies off.
+    # discount one second. With a discount of 0.998 and targets of one interval the policy flies off.
     exploration=ExplorationConfig(correlation_time=0.05),
     learner=LearnerConfig(
         critic_iterations=1000,
@@ -55,25 +69,9 @@ PAPER = TwinningConfig(
         reward_scale=1e-3,
         actor_rate=1e-4,
     ),
-    # The gust is smooth over its 3 s, and the residual of a regression would be taken for drag: with a kernel of 0.3 s
-    # and a tube of 2e-4 the residual is 1e-4 m/s.
-    exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
-    assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
-    planner=PlannerConfig(
-        iterations=5,
-        starts=0,
-        episode_gradient_limit=math.inf,
-        extremes=0,
-        descent=DescentConfig(rate=0.2, gradient_limit=0.5),
-        receding_horizon=PREDICTIVE,
-    ),
-    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=4),
-    hypotheses=HypothesesConfig(which="none"),
-)
-CONVERGED = dataclasses.replace(
-    PAPER,
     # Twenty flights hardly meet the rare gusts that cost most, and a plan on those that were met is too mild.
-    exogenous=dataclasses.replace(PAPER.exogenous, large_scale="mixed"),
+    exogenous=dataclasses.replace(GUST, large_scale="mixed"),
+    assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     # A valley of the cost is narrow where the stroke plane tilts fast: Adam leaves 1 to 2 % there.
     planner=PlannerConfig(
         iterations=30,
@@ -81,29 +79,29 @@ CONVERGED = dataclasses.replace(
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PREDICTIVE,
     ),
-    hypotheses=HypothesesConfig(),
-    referee=dataclasses.replace(PAPER.referee, rule="expected_cost"),
+    referee=RefereeConfig(patience=4, clone_patience=4),
 )
 """Configuration of the training by default."""
 HOP = dataclasses.replace(
-    CONVERGED,
+    DEFAULT,
     # Where a hop meets 3 m/s against it, it costs ten times as much as others. Ten flights hardly meet such a gust, and
     # twenty virtual episodes do not say which of two plans is better in it.
     virtual_episodes=120,
     # On one record a lag that is not there may replay better than the twin alone.
     records=3,
-    planner=dataclasses.replace(CONVERGED.planner, realisations=40),
+    planner=dataclasses.replace(DEFAULT.planner, realisations=40),
 )
 """Configuration of the training with ``--task hop``."""
 NEURAL = dataclasses.replace(
-    PAPER,
+    DEFAULT,
     # Segments last five wing beats, 0.25 s, because over whole flights most steps fail. They use the measured wind,
     # because three hundred weights on every draw of the wind would take gigabytes.
     assimilation=AssimilationConfig(
         iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
     ),
+    hypotheses=HypothesesConfig(which="none"),
 )
-"""Configuration of the training with ``--closure mlp``."""
+"""Configuration of the training with ``--preset neural``."""
 
 
 OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
@@ -121,8 +119,6 @@ class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
-        paper: train as the paper does, with its random start, policy, observations and numbers of gradients, as far as
-            other options do not say otherwise.
         policy: mlp, or paper (an affine law of the observation with offset: 10 weights for the errors).
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
@@ -142,7 +138,6 @@ class Config(RunConfig):
             planes), delay, sag, gust, lift_lag, all_1 and all_2; docs/unknown_systems.md describes them.
     """
 
-    paper: bool = False
     policy: Literal["mlp", "paper"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
     start: str = "controller"
@@ -160,7 +155,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
-    twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
+    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
 
     def __post_init__(self):
         super().__post_init__()
@@ -175,12 +170,12 @@ class Config(RunConfig):
         if not 0.0 <= self.wind_deviation <= STORM:
             raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
 
-    def defaults(self) -> "Config":
-        if self.paper:
-            twinning = NEURAL if self.closure == "mlp" else PAPER
-            return Config(paper=True, policy="paper", start="random", twinning=twinning)
-        twinning = NEURAL if self.closure == "mlp" else HOP if self.task == "hop" else CONVERGED
-        return Config(twinning=self.suited(twinning))
+    def presets(self) -> dict[Preset, dict[str, Any]]:
+        return super().presets() | {
+            "default": {"twinning": HOP if self.task == "hop" else DEFAULT},
+            "paper": {"policy": "paper", "start": "random", "twinning": PAPER_T2},
+            "neural": {"closure": "mlp", "twinning": NEURAL},
+        }
 
     def plant(self) -> Plant:
         return unknown(self.drone(MASS), self.unknown)
@@ -196,7 +191,7 @@ class Config(RunConfig):
             cost=self.cost(),
             mass=mass,
             stroke_plane_rate=self.stroke_plane_rate,
-            observe=self.observe or ("paper" if self.paper else OBSERVED[self.policy],),
+            observe=self.observe or ("paper" if self.preset == "paper" else OBSERVED[self.policy],),
         )
 
     def cost(self) -> TrackingCost:

@@ -70,9 +70,9 @@ class Learner:
         self.policies = {role: self.plant.make_policy(generator) for role in ("model_free", "model_based")}
         twin = DigitalTwin(self.plant, self.plant.make_closure(generator))
         env = PlantEnv(self.plant, seed=config.seed)
-        from wind_turbine import CONVERGED
+        from wind_turbine import DEFAULT
 
-        self.algorithm = ReinforcementTwinning(env, twin, **self.policies, config=CONVERGED, generator=generator)
+        self.algorithm = ReinforcementTwinning(env, twin, **self.policies, config=DEFAULT, generator=generator)
         from tensordict import TensorDict  # here, because it takes seconds to load, and a command line needs none
 
         self.episode = self.algorithm(TensorDict({"number": 0}))

@@ -125,7 +125,7 @@ def settings(config: Config) -> RunConfig:
     """The options of a training as in the paper; that of the turbine if no plant is named."""
     recipe = load_recipe(Path(__file__).with_name(f"{config.plant or 'wind_turbine'}.py"))
     horizon = {} if config.horizon is None else {"horizon": config.horizon}
-    return dataclasses.replace(recipe.Config(paper=True).defaults(), **horizon)
+    return dataclasses.replace(recipe.Config(preset="paper").defaults(), **horizon)
 
 
 def limit_of(options: RunConfig) -> LimitConfig:

@@ -1,7 +1,6 @@
 """Reinforcement twinning of a wind turbine that is served over OPC UA or Modbus, while it operates."""
 
 import contextlib
-import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -62,11 +61,6 @@ class Config(Turbine):
             raise ValueError("operation.clock must be wall: a served plant keeps its own time and does not wait.")
         if self.real != "simulation":
             raise ValueError(f"real={self.real!r} is another real system; the served one is the simulation.")
-
-    def defaults(self) -> "Config":
-        found = super().defaults()
-        own = {"asynchronous", "operation"}
-        return Config(**{f.name: getattr(found, f.name) for f in dataclasses.fields(Turbine) if f.name not in own})
 
     @staticmethod
     def usual_operation() -> OperationConfig:

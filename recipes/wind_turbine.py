@@ -1,12 +1,11 @@
 """Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading
 
@@ -17,6 +16,7 @@ import torch
 from torch import nn
 
 from rt_torchrl import (
+    PAPER,
     AssimilationConfig,
     DescentConfig,
     HypothesesConfig,
@@ -25,7 +25,7 @@ from rt_torchrl import (
     PlannerConfig,
     Plant,
     PredictiveConfig,
-    RefereeConfig,
+    Preset,
     RunConfig,
     TwinningConfig,
     main_of,
@@ -43,39 +43,26 @@ if TYPE_CHECKING:
 
     from rt_torchrl import Snapshot
 
-PAPER = TwinningConfig(
-    # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
+LBFGS = DescentConfig(optimiser="lbfgs", rate=1.0)
+PAPER_T1 = dataclasses.replace(PAPER, planner=dataclasses.replace(PAPER.planner, descent=LBFGS))
+"""Configuration of the training with ``--preset paper``: Table 1 of the paper, row T1."""
+DEFAULT = TwinningConfig(
     # Targets span 5 s: an action of 0.5 s moves a rotor with a time constant of 16 s by less than the critic's error.
     learner=LearnerConfig(return_steps=10),
-    planner=PlannerConfig(
-        iterations=10,
-        starts=0,
-        episode_gradient_limit=math.inf,
-        extremes=0,
-        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
-        receding_horizon=PredictiveConfig(horizon=20.0),
-    ),
-    referee=RefereeConfig(rule="decision_tree"),
-    hypotheses=HypothesesConfig(which="none"),
-)
-CONVERGED = dataclasses.replace(
-    PAPER,
     # Fits and plans converge over the episodes. The wind is the measured one, because draws of it leave an error in the
     # closure, and the plans 1 to 2 % above the optimum. While the first closures are wrong, a plan of a hundred
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
-    assimilation=AssimilationConfig(iterations=60, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    assimilation=AssimilationConfig(iterations=60, inputs="record", descent=LBFGS),
     planner=PlannerConfig(
         iterations=25,
         realisations=50,
-        descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
+        descent=dataclasses.replace(LBFGS, tolerance=1e-6),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
-    hypotheses=HypothesesConfig(),
-    referee=RefereeConfig(),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(
-    PAPER,
+    DEFAULT,
     # Inputs are the measured wind, because a draw of it hides what the perceptron adds. Segments last 10 s, less than
     # the rotor's time constant of 16 s, because over whole records most steps fail. One wind shows a part of (λ, β),
     # so that there are six.
@@ -83,8 +70,9 @@ NEURAL = dataclasses.replace(
     assimilation=AssimilationConfig(
         iterations=10, method="levenberg_marquardt", inputs="record", segment=20, prior=0.02
     ),
+    hypotheses=HypothesesConfig(which="none"),
 )
-"""Configuration of the training with ``--closure mlp``."""
+"""Configuration of the training with ``--preset neural``."""
 
 OBSERVED = {"paper": "paper", "bias": "paper", "scheduled": "scheduled", "mlp": "measured+wind"}
 """What each kind of policy observes by default."""
@@ -95,8 +83,6 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        paper: train as the paper does, with its random start, policy, observations and numbers of gradients, as far as
-            other options do not say otherwise.
         policy: mlp, paper (an affine law of the observation without bias: 4 weights for e1 and e2), bias (that law with
             bias: 6 weights), or scheduled (torque by the square of the speed and gain-scheduled PI pitch, whose gains
             start detuned).
@@ -120,7 +106,6 @@ class Config(RunConfig):
             episodes or, if that is 0, on unseen ones; this needs the extra rosco.
     """
 
-    paper: bool = False
     policy: Literal["mlp", "paper", "bias", "scheduled"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
     start: str = "controller"
@@ -136,7 +121,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     real: Literal["simulation", "rosco"] = "simulation"
-    twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
+    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
 
     def __post_init__(self):
         super().__post_init__()
@@ -159,11 +144,9 @@ class Config(RunConfig):
                 "observe what both see."
             )
 
-    def defaults(self) -> "Config":
-        twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
-        if self.paper:
-            return Config(paper=True, policy="paper", start="random", twinning=twinning)
-        return Config(twinning=self.suited(twinning))
+    def presets(self) -> dict[Preset, dict[str, Any]]:
+        paper = {"policy": "paper", "start": "random", "twinning": PAPER_T1}
+        return super().presets() | {"paper": paper, "neural": {"closure": "mlp", "twinning": NEURAL}}
 
     def plant(self) -> Plant:
         return unknown(self.turbine(), self.unknown)
@@ -177,7 +160,7 @@ class Config(RunConfig):
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
             wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
-        usual = "paper" if self.paper and self.policy == "mlp" else OBSERVED[self.policy]
+        usual = "paper" if self.preset == "paper" and self.policy == "mlp" else OBSERVED[self.policy]
         cost = self.engineering if self.task == "engineering" else PaperCost()
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))
 

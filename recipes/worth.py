@@ -48,10 +48,13 @@ def arms_of(case: str) -> dict[str, Options]:
     """Options of every arm on a plant, by name."""
     every = (*HYPOTHESES, *EVIDENCE)
     planned = ("--twinning.arm", "model_based")
-    free = ("--paper", "--twinning.arm", "model_free")
+    free = ("--preset", "paper", "--twinning.arm", "model_free")
     found: dict[str, Options] = {
         WHOLE: every,
-        "twinning of the paper": ("--paper",),
+        "twinning of the paper": (
+            "--preset",
+            "paper",
+        ),
         "model-free, DDPG": free,
         "twinning from random weights": (*every, *RANDOM),
         "the same without the belief": (*HYPOTHESES, *TREE, *RANDOM),

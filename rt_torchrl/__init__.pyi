@@ -57,6 +57,7 @@ from .fit.uncertainty import Uncertainty
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
 from .steps.config import (
+    PAPER,
     AssimilationConfig,
     ConstraintsConfig,
     ExogenousConfig,
@@ -81,7 +82,7 @@ from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.machine import require_device
 from .runs.run import Run
-from .runs.run_config import RunConfig
+from .runs.run_config import Preset, RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
@@ -92,6 +93,7 @@ from .export import export_c, export_controller, export_onnx, export_program, ex
 __version__: str
 
 __all__ = [
+    "PAPER",
     "ActorCritic",
     "Actuation",
     "AssimilationConfig",
@@ -161,6 +163,7 @@ __all__ = [
     "PositiveCoefficients",
     "PredictiveConfig",
     "PredictiveControl",
+    "Preset",
     "Preview",
     "Reading",
     "RealController",

@@ -161,7 +161,7 @@ class ReinforcementTwinning(TensorDictSequential):
             "learn": Learn(learner, belief, judged),
             "inputs": FitInputs(virtual),
             "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
-            "plan": MakePlan(planning, count, judged),
+            "plan": MakePlan(planning, count, judged, recorded=config.planner.initial == "record"),
             "switch": Switch(referee, policies, belief, imitation, halves, learner.observations, judged),
         }
         super().__init__(OrderedDict((name, steps[name]) for name in ARMS[config.arm]))

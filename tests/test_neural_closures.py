@@ -239,7 +239,7 @@ def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
         monkeypatch.setattr("sys.argv", ["wind_turbine.py", "--start", "random", *options])
         main_of(recipe.Config, seen.append)
     default, neural, chosen = (config.twinning for config in seen)
-    assert default == recipe.CONVERGED and neural == recipe.NEURAL != default
+    assert default == recipe.DEFAULT and neural == recipe.NEURAL != default
     assert chosen.records == 3 and chosen.assimilation == neural.assimilation
     assert [type(c.make_closure(PLANTS[0], seeded())).__name__ for c in seen[:2]] == [
         "SaintDrenan",

@@ -332,7 +332,7 @@ def test_the_tank_takes_it_with_duty_cycles(tmp_path):
 
 def test_the_tank_refuses_it_with_a_half_open_valve():
     module = recipe_named("cryogenic_tank")
-    planner = dataclasses.replace(module.CONVERGED.planner, method="receding_horizon")
-    twinning = dataclasses.replace(module.CONVERGED, planner=planner)
+    planner = dataclasses.replace(module.DEFAULT.planner, method="receding_horizon")
+    twinning = dataclasses.replace(module.DEFAULT, planner=planner)
     with pytest.raises(ValueError, match="command='drop' does not go with start='mpc' or method=.*Use command duty"):
         module.Config(command="drop", twinning=twinning)

@@ -101,31 +101,41 @@ PLANTS = {
     "flapping_wing": ("--start", "random"),
     "cryogenic_tank": ("--start", "random", "--command", "drop", "--end-weight", "0"),
 }
+ROWS = {"wind_turbine": "T1", "flapping_wing": "T2", "cryogenic_tank": "T3"}
 
 
 @pytest.mark.parametrize("plant", PLANTS)
 def test_the_paper_is_one_option(plant):
     """Its policy, observations, cost and numbers of gradients; the other defaults are apart from them."""
-    made, paper = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant, "--paper")
-    assert paper.twinning == made.PAPER != of_command_line(plant, "--start", "random").twinning == made.CONVERGED
+    made, paper = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant, "--preset", "paper")
+    row = getattr(made, f"PAPER_{ROWS[plant]}")
+    assert paper.twinning == row != of_command_line(plant, "--start", "random").twinning == made.DEFAULT
     usual = of_command_line(plant).twinning
-    quiet = dataclasses.replace(made.CONVERGED.exploration, spread=0.02)
-    assert usual == dataclasses.replace(made.CONVERGED, exploration=quiet) != made.CONVERGED
+    quiet = dataclasses.replace(made.DEFAULT.exploration, spread=0.02)
+    assert usual == dataclasses.replace(made.DEFAULT, exploration=quiet) != made.DEFAULT
     spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
-    assert dataclasses.replace(spelled, paper=True, observe=(), twinning=made.PAPER) == paper
+    assert dataclasses.replace(spelled, preset="paper", observe=(), twinning=row) == paper
     assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost
     default = of_command_line(plant).plant()
     assert (default.observations, default.actions) != (paper.plant().observations, paper.plant().actions)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_options_that_are_given_hold_with_the_paper_too(plant):
-    found = of_command_line(
-        plant, "--paper", "--policy", "mlp", "--closure", "mlp", "--twinning.planner.iterations", "7"
-    )
-    assert found.policy == "mlp" and found.twinning.planner.iterations == 7
-    assert found.twinning.assimilation == load_recipe(RECIPES / f"{plant}.py").NEURAL.assimilation
-    assert found.plant().observations == of_command_line(plant, "--paper").plant().observations
+def test_options_that_are_given_hold_with_a_preset_too(plant):
+    asked = "--preset", "paper", "--policy", "mlp", "--closure", "mlp", "--twinning.planner.iterations", "7"
+    found = of_command_line(plant, *asked)
+    assert found.policy == "mlp" and found.twinning.planner.iterations == 7 and found.closure == "mlp"
+    assert found.plant().observations == of_command_line(plant, "--preset", "paper").plant().observations
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_presets_of_a_neural_closure_and_of_predictive_control(plant):
+    made, usual = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant)
+    neural, mpc = (of_command_line(plant, "--preset", preset) for preset in ("neural", "mpc"))
+    assert neural.closure == "mlp" and neural.twinning.assimilation == made.NEURAL.assimilation
+    assert dataclasses.replace(neural, preset="default") == of_command_line(plant, "--closure", "mlp")
+    assert mpc.twinning.planner == dataclasses.replace(usual.twinning.planner, method="receding_horizon")
+    assert dataclasses.replace(mpc, preset="default", twinning=usual.twinning) == usual
 
 
 def test_a_plant_without_a_paper_has_no_words_of_it():
@@ -138,7 +148,7 @@ def test_a_plant_without_a_paper_has_no_words_of_it():
     [
         ([], 0.02, 32),
         (["--start", "random"], 0.2, 32),
-        (["--paper"], 0.2, 0),
+        (["--preset", "paper"], 0.2, 0),
         (["--starts", "random", "--episodes", "0"], 0.02, 32),  # what cannot be carried out
     ],
 )

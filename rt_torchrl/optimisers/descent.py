@@ -113,14 +113,13 @@ class Descent:
                 weights, lr=self.config.rate, tolerance_change=self.config.tolerance, line_search_fn="strong_wolfe"
             )
 
-    def run(self, cost: Callable[[], Tensor], iterations: int, *, stop_below: float = 0.0) -> Descended:
+    def run(self, cost: Callable[[], Tensor], iterations: int, *, stop_below: float = -math.inf) -> Descended:
         """Take ``iterations`` gradients of ``cost`` and keep the best weights.
 
         Args:
             cost: function that returns the scalar cost at the module's present weights; it stays the same in a run.
             iterations: number of gradients; 0 does nothing.
-            stop_below: share of the first cost below which the run stops early; 0 never stops it, and neither does
-                any share of a first cost that is not positive.
+            stop_below: cost below which the run stops early.
 
         Raises:
             FloatingPointError: if the cost diverges at the weights that the descent starts from.
@@ -277,6 +276,5 @@ class _Seen:
     def _note(self, cost: float) -> None:
         if cost < self.best or math.isnan(self.best):
             self.best, self.best_weights = cost, copy.deepcopy(self._module.state_dict())
-        least = self._stop_below * self.start
-        if cost < least and least > 0.0:  # a cost that starts at or below zero has no shares
+        if cost < self._stop_below:
             raise _Finished

@@ -17,6 +17,7 @@ Denmark.
 """
 
 import copy
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -59,22 +60,23 @@ class LevenbergMarquardt:
         self.module, self.damping, self.tolerance, self.longest_step = module, damping, tolerance, longest_step
 
     @torch.no_grad()
-    def run(self, equations: Callable[[], NormalEquations], iterations: int, *, stop_below: float = 0.0) -> Descended:
+    def run(
+        self, equations: Callable[[], NormalEquations], iterations: int, *, stop_below: float = -math.inf
+    ) -> Descended:
         """Try ``iterations`` steps; a step that raises the cost, or makes it infinite, is taken back.
 
         Args:
             equations: function that returns the equations at the module's present weights.
             iterations: number of trial steps; 0 does nothing.
-            stop_below: share of the first cost below which the run stops early; 0 never stops it, and neither does
-                any share of a first cost that is not positive.
+            stop_below: cost below which the run stops early.
         """
         if iterations == 0:
             return Descended(float("nan"), float("nan"), float("nan"), 0)
         weights = [w for w in self.module.parameters() if w.requires_grad]
         current = equations()
         start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
-        scale, growth, least = torch.zeros_like(current.gradient), 2.0, stop_below * start
-        while count < iterations and not (current.cost < least and least > 0.0):
+        scale, growth = torch.zeros_like(current.gradient), 2.0
+        while count < iterations and current.cost >= stop_below:
             safe_point()
             if self._arrived(current):
                 break

@@ -18,12 +18,13 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
 from rt_torchrl.runs.loggers import LoggerName, require_loggers
-from rt_torchrl.steps.config import HypothesesConfig, Role, TwinningConfig
+from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, ShortHorizonConfig, TwinningConfig
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""
+Preset = Literal["default", "paper", "neural", "mpc"]
 STARTS = ("random", "controller", "mpc")
 """Values of the option ``start`` that name no file."""
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
@@ -36,14 +37,16 @@ class RunConfig:
     """The options that every recipe has.
 
     Args:
+        preset: what the other options are by default: ``default``; ``paper`` for the paper's algorithm with its random
+            start; ``neural`` for a closure with a perceptron in it; ``mpc`` for model predictive control in the place
+            of the model-based policy.
         policy: kind of both policies: plant for the plant's own policy, or mlp. A recipe may call its plant's own
             policy paper, and offer other policies.
         hidden: widths of the hidden layers of an mlp policy.
         model_free_policy: kind of the model-free policy, one of the choices of policy; same for the kind and the
             initial weights of the model-based policy.
         closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
-            call its plant's own law paper, and may train an mlp with other defaults of twinning.records and
-            twinning.assimilation, which it calls NEURAL.
+            call its plant's own law paper. An mlp has the defaults of the preset neural.
         closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number n_e of real episodes.
         patience: number of episodes without a gain of 1 % in the live policy's cost on the twin after which the
@@ -99,6 +102,7 @@ class RunConfig:
         ValueError: if an option is out of its range, or is none of its choices.
     """
 
+    preset: Preset = "default"
     policy: Literal["plant", "mlp"] = "plant"
     hidden: tuple[int, ...] = (32, 32)
     model_free_policy: str = "same"
@@ -254,6 +258,20 @@ class RunConfig:
         """
         return None
 
+    def presets(self) -> dict[Preset, dict[str, Any]]:
+        """The options that each preset sets.
+
+        Override this method where a plant has other ones, or where they depend on other options.
+        """
+        usual = type(self)().twinning
+        planner = dataclasses.replace(usual.planner, method="receding_horizon", short_horizon=ShortHorizonConfig())
+        return {
+            "default": {},
+            "paper": {"start": "random", "twinning": PAPER},
+            "neural": {"closure": "mlp"},
+            "mpc": {"twinning": dataclasses.replace(usual, planner=planner)},
+        }
+
     def suited(self, twinning: TwinningConfig) -> TwinningConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
@@ -268,13 +286,15 @@ class RunConfig:
         return dataclasses.replace(twinning, exploration=exploration)
 
     def defaults(self) -> "RunConfig":
-        """The defaults of all options on a command line, given the start, closure and sensors that it asks for.
+        """The defaults of all options on a command line, given the preset, start, closure and sensors that it asks for.
 
-        Override this method if other defaults depend on options; see
-        :func:`rt_torchrl.runs.command_line.from_command_line`.
+        See :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
         usual = type(self)()
-        return dataclasses.replace(usual, twinning=self.suited(usual.twinning))
+        preset: Preset = "neural" if self.closure == "mlp" and self.preset == "default" else self.preset
+        found = dataclasses.replace(usual, preset=self.preset, **self.presets()[preset])
+        begun = self if self.start != usual.start else dataclasses.replace(self, start=found.start)
+        return dataclasses.replace(found, twinning=begun.suited(found.twinning))
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Function from an episode's number to the real system's closure; None if the real system does not wear.

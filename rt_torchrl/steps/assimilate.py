@@ -189,7 +189,7 @@ class Assimilation:
             found = self.descent.run(
                 lambda: self._identification_cost(replayed) + self.prior.cost(),
                 config.iterations,
-                stop_below=config.stop_ratio,
+                stop_below=config.stop_below,
             )
         if math.isinf(found.start):
             raise FloatingPointError("J_p of finite states overflows")
@@ -204,8 +204,7 @@ class Assimilation:
             method = LevenbergMarquardt(
                 likelihood.unknowns, damping=DAMPING if number else self.damping, tolerance=tolerance
             )
-            stop_below = 0.0 if number else config.stop_ratio
-            found = method.run(likelihood.normal_equations, config.iterations, stop_below=stop_below)
+            found = method.run(likelihood.normal_equations, config.iterations, stop_below=config.stop_below)
             if not number:
                 self.damping = method.damping
             return found

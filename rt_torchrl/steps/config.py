@@ -1,5 +1,6 @@
 """Hyper-parameters of the six steps."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -15,7 +16,7 @@ Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 RefereeName = Literal["decision_tree", "expected_cost"]
 LargeScale = Literal["met", "mixed"]
-LearnerName = Literal["ddpg", "td3", "sac", "crossq", "redq"]
+LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +51,10 @@ class LearnerConfig:
     """Parameters of step 2.
 
     Args:
-        algorithm: model-free method, a loss of TorchRL: ``ddpg``, as in the paper; ``td3``, which takes the lower value
-            of two critics, delays the policy and smooths the targets; or one that also prices the entropy of a policy
-            with noise: ``sac``, ``crossq`` (normalised layers instead of targets) or ``redq`` (more critics).
+        algorithm: model-free method, a loss of TorchRL: ``ddpg``; ``relaxed_ddpg``, DDPG as the paper prints it, whose
+            critic is its own target and takes the share τ of every step; ``td3``, which takes the lower value of two
+            critics, delays the policy and smooths the targets; or one that also prices the entropy of a policy with
+            noise: ``sac``, ``crossq`` (normalised layers instead of targets) or ``redq`` (more critics).
         critic_iterations: number n_Q of critic iterations per episode.
         actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every second critic
             iteration instead, the others one for each.
@@ -63,7 +65,7 @@ class LearnerConfig:
             sum over more intervals mends that.
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
             scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
-        target_rate: rate τ at which the targets follow.
+        target_rate: rate τ at which the targets follow, or share of its step that a relaxed critic takes.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
         gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
@@ -216,8 +218,12 @@ class PlannerConfig:
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
+        initial: where the virtual episodes of a plan begin: ``drawn`` for random initial states of the plant, or
+            ``record`` for that of the last real episode, as in the paper.
         starts: number of random policies, the best of which is a start of plans over whole episodes
             (:class:`MultiStart`); 0 plans from the present weights alone, as in the paper.
+        accepts: plans that stay: those that are ``better`` on other virtual episodes than the policy before, or
+            ``every`` one, as in the paper, which begins with the present weights.
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
             descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
             infinite for none, as in the paper.
@@ -235,7 +241,9 @@ class PlannerConfig:
     method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
     iterations: int = 10
     realisations: int | None = None
+    initial: Literal["drawn", "record"] = "drawn"
     starts: int = 32
+    accepts: Literal["better", "every"] = "better"
     episode_gradient_limit: float = 10.0
     experience: int = 100
     extremes: int = 1000
@@ -264,6 +272,8 @@ class PlannerConfig:
         for argument, least in (("iterations", 0), ("starts", 0), ("extremes", 0), ("experience", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the planning must be at least {least}.")
+        if self.accepts == "every" and self.starts:
+            raise ValueError(f"accepts='every' plan needs starts=0, not {self.starts}: what is kept is not compared.")
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
         if not self.episode_gradient_limit >= 1.0:
@@ -312,8 +322,7 @@ class AssimilationConfig:
 
     Args:
         iterations: number n_G of gradients per episode.
-        stop_ratio: share of the J_p at the start of the episode below which the descent ends; with 0 it never ends
-            early.
+        stop_below: J_p below which the descent ends; with 0 it never ends early.
         inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
             paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
             it also does not find weights that move the states less than that chance does.
@@ -337,14 +346,14 @@ class AssimilationConfig:
         sensors: names of the states and measurements that sensors read, to which the twin is fitted by maximum
             likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
             states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
-            the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
+            the mean square of the residuals in units of the noise, and ``stop_below`` has no effect. Sensors need
             ``levenberg_marquardt``, the inputs of the ``record`` and ``initial="estimated"``.
         biased: names of the sensors that may be off by a constant, which is estimated.
         descent: parameters of the closure's descent.
     """
 
     iterations: int = 15
-    stop_ratio: float = 0.0
+    stop_below: float = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     starts: int = 1
@@ -359,8 +368,8 @@ class AssimilationConfig:
         check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
-        if not 0.0 <= self.stop_ratio < 1.0:
-            raise ValueError(f"stop_ratio={self.stop_ratio} must lie in [0, 1).")
+        if not self.stop_below >= 0.0:
+            raise ValueError(f"stop_below={self.stop_below} of the assimilation must not be negative.")
         if not self.prior >= 0.0:
             raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
         if self.segment is not None and self.segment < 0:
@@ -491,3 +500,20 @@ class TwinningConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 < self.least_sound <= 1.0:
             raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")
+
+
+PAPER = TwinningConfig(
+    learner=LearnerConfig(
+        algorithm="relaxed_ddpg",
+        target_rate=0.02,
+        gradient_limit=math.inf,
+        memory=LongTermMemoryConfig(correction=0.0),
+    ),
+    planner=PlannerConfig(
+        initial="record", starts=0, accepts="every", episode_gradient_limit=math.inf, experience=1, extremes=0
+    ),
+    referee=RefereeConfig(rule="decision_tree"),
+    hypotheses=HypothesesConfig(which="none"),
+)
+"""The paper's algorithm, with the numbers of its first test case (Table 1, row T1). Of what the paper does not print,
+τ is 0.02, with which the critic stays finite, and optimisers, their rates and the exploration are the library's."""

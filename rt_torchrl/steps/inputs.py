@@ -279,6 +279,8 @@ class VirtualEpisodes:
     ):
         self.twin, self.config, self.constraints, self.generator = twin, config, constraints, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
+        self.recorded: Tensor | None = None
+        """Initial state of the last whole real episode."""
         self.extremes = extreme_states(twin.plant, extremes, generator.device)
 
     def wanting(self, arm: str) -> bool:
@@ -286,8 +288,9 @@ class VirtualEpisodes:
         return arm != "model_free" and not self.processes
 
     def learn(self, record: Trajectory) -> None:
-        """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
+        """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state."""
         self.processes.append(self._process(record))
+        self.recorded = record.states[0]
 
     def repeated(self, record: Trajectory) -> Scenario:
         """The start and the inputs of a real episode, which are continued to the horizon if it ended early."""
@@ -319,16 +322,24 @@ class VirtualEpisodes:
         acted = record.exogenous[:, : len(signals)]
         return ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config)
 
-    def draw(self, count: int) -> Scenario:
-        """Draw random initial states, and exogenous inputs from the processes that are kept.
+    def draw(self, count: int, *, recorded: bool = False) -> Scenario:
+        """Draw initial states, and exogenous inputs from the processes that are kept.
 
         Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
         states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
         one wind of twenty.
+
+        Args:
+            count: number of virtual episodes.
+            recorded: whether they all begin as the last real episode did.
         """
         plant, large_scale = self.twin.plant, self.config.large_scale
-        initial_state = plant.draw_initial_state(count, self.generator)
+        if recorded:
+            assert self.recorded is not None  # inputs are drawn once a whole episode is known
+            initial_state = self.recorded.repeat(count, 1)
+        else:
+            initial_state = plant.draw_initial_state(count, self.generator)
         exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
         return Scenario(initial_state, plant.with_previews(exogenous))
 
@@ -374,13 +385,14 @@ class VirtualEpisodes:
         return Scenario(self.extremes, episodes.exogenous[order])
 
     def state_dict(self) -> dict[str, Any]:
-        return {"processes": [process.state_dict() for process in self.processes]}
+        return {"processes": [process.state_dict() for process in self.processes], "recorded": self.recorded}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.processes.clear()
         self.processes.extend(
             ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
         )
+        self.recorded = state["recorded"]
 
 
 class FitInputs(Step):

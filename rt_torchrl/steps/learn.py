@@ -88,6 +88,7 @@ class LearningMethod(NamedTuple):
             critic first, each with one of its target, and then those of the policy, as the paper does.
         squared: whether the loss reports δ² as ``td_error``, and not |δ|.
         normalised: whether the layers of the critics are normalised over a batch.
+        relaxed: whether a critic without targets takes only the share τ of each of its steps.
     """
 
     make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
@@ -96,11 +97,12 @@ class LearningMethod(NamedTuple):
     delay: int = 1
     squared: bool = True
     normalised: bool = False
+    relaxed: bool = False
 
 
-def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
-    """DDPG, the paper's method (section 4.1)."""
-    return DDPGLoss(actor, critics[0], loss_function="l2", delay_value=True)
+def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, target: bool = True) -> LossModule:
+    """DDPG, the paper's method (section 4.1), with a target of the critic or without one, as its line 17 has it."""
+    return DDPGLoss(actor, critics[0], loss_function="l2", delay_value=target)
 
 
 def td3_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
@@ -123,6 +125,7 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
 
 METHODS: dict[str, LearningMethod] = {
     "ddpg": LearningMethod(ddpg_loss, delay=0),
+    "relaxed_ddpg": LearningMethod(functools.partial(ddpg_loss, target=False), delay=0, relaxed=True),
     "td3": LearningMethod(td3_loss, critics=2, delay=2),
     "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
     "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
@@ -551,8 +554,13 @@ class Iteration:
             share = (learner.config.gradient_limit / (norm + TINY)).clamp(max=1.0)
             results += [-losses["loss_actor"].detach(), norm]
             steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
+        relaxed = learner.critic_adam.weights if self.critic and learner.method.relaxed else []
+        before = [weight.detach().clone() for weight in relaxed]
         for optimiser, gradients in steps:
             optimiser.step(gradients)
+        with torch.no_grad():
+            for weight, earlier in zip(relaxed, before, strict=True):  # w ← τ w + (1 − τ) w'
+                weight.copy_(torch.lerp(earlier, weight, learner.config.target_rate))
         if self.target is not None:
             self.target.step()
         return results

@@ -207,9 +207,9 @@ class MultiStart:
     that have flown and are expected to cost least. Where the twin is wrong, what has flown stays as it is if it is
     expected to cost less than every plan.
 
-    Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the previous policy on N other
-    winds, because the best policy for a few winds can lie just beyond a cliff of another wind. State feedback plans
-    while it acts, so that there is nothing to compare.
+    Note: the paper keeps every plan, as ``accepts="every"`` does. Here a plan made on N_z winds is compared with the previous
+    policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another wind. State
+    feedback plans while it acts, so that there is nothing to compare.
 
     Random policies have random numbers of their own, so that a training whose plan they do not improve is the same
     without them.
@@ -233,8 +233,10 @@ class MultiStart:
         make_policy: Callable[[torch.Generator], nn.Module] | None = None,
     ):
         self.planner, self.belief, self.virtual = planner, belief, belief.virtual
-        several = config.whole and not isinstance(planner.policy, StateFeedback)
-        self.count = config.starts if several else 0
+        fed_back = isinstance(planner.policy, StateFeedback)
+        self.judges = config.accepts == "better" and not fed_back
+        """Whether plans are compared; else every one is kept."""
+        self.count = config.starts if config.whole and not fed_back else 0
         self.make_policy = make_policy or self.virtual.twin.plant.make_policy
         self._first: Weights | None = None
         self._stalled = 0
@@ -263,9 +265,10 @@ class MultiStart:
             DivergenceError: if the twin diverges with the weights that have just flown.
         """
         policy = self.planner.policy
-        if isinstance(policy, StateFeedback):
+        if not self.judges:
             found = self._descended(planned_on)
-            return findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
+            found = findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
+            return merged(found, self._raised(planned_on))
         present = copy.deepcopy(policy.state_dict())
         stays = self.belief.judge(policy, judged_on)
         if not math.isfinite(stays.price):
@@ -423,18 +426,19 @@ class MakePlan(Step):
         planning: the plans of an episode.
         count: number N_z of virtual episodes that plans are made on.
         judged: number of virtual episodes on which they are judged.
+        recorded: whether plans are made from the initial state of the last real episode.
     """
 
     in_keys = ["number", "J_p", "large_scale"]
     out_keys = [("weight_changes", "model_based")]
 
-    def __init__(self, planning: MultiStart, count: int, judged: int):
+    def __init__(self, planning: MultiStart, count: int, judged: int, *, recorded: bool = False):
         super().__init__(planner=planning.planner, planning=planning)
-        self.planning, self.count, self.judged = planning, count, judged
+        self.planning, self.count, self.judged, self.recorded = planning, count, judged, recorded
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         policy, virtual = self.planning.planner.policy, self.planning.virtual
         weights = weight_vector(policy)
-        planned_on, judged_on = map(virtual.draw, (self.count, self.judged))
+        planned_on, judged_on = virtual.draw(self.count, recorded=self.recorded), virtual.draw(self.judged)
         report = self.planning.plan(int(episode["number"]) + 1, planned_on, judged_on)
         return merged(episode, report).set(("weight_changes", "model_based"), weight_change(policy, weights))

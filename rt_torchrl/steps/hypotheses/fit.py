@@ -187,7 +187,7 @@ class Fit:
             method="levenberg_marquardt",
             initial="measured",
             segment=0,
-            stop_ratio=0.0,
+            stop_below=0.0,
             iterations=STEPS,
         )
         self.short = Assimilation(twin.of(Reread(twin.plant)), short)
