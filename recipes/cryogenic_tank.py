@@ -49,7 +49,7 @@ PAPER_T3 = dataclasses.replace(
     realisations=1,
     learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
     exogenous=LOAD,
-    assimilation=AssimilationConfig(iterations=30),
+    assimilation=dataclasses.replace(PAPER.assimilation, iterations=30),
     planner=dataclasses.replace(PAPER.planner, iterations=5, descent=LBFGS),
     referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
 )

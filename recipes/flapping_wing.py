@@ -50,7 +50,7 @@ PAPER_T2 = dataclasses.replace(
     PAPER,
     learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
     exogenous=GUST,
-    assimilation=AssimilationConfig(stop_below=1e-2),
+    assimilation=dataclasses.replace(PAPER.assimilation, stop_below=1e-2),
     planner=dataclasses.replace(
         PAPER.planner, iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
     ),

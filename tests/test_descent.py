@@ -278,6 +278,7 @@ def test_the_gradient_at_which_a_run_stops_is_counted(optimiser):
 
 def test_newton_steps_take_a_negative_cost_to_its_minimum():
     """They end where a step promises less than 1e-4 of the cost, or at the first cost below a threshold."""
+
     def found_with(**options):
         point = Point()
         cost = Bowl(point, offset=-20.0)

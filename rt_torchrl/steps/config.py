@@ -509,6 +509,7 @@ PAPER = TwinningConfig(
         gradient_limit=math.inf,
         memory=LongTermMemoryConfig(correction=0.0),
     ),
+    assimilation=AssimilationConfig(segment=0),
     planner=PlannerConfig(
         initial="record", starts=0, accepts="every", episode_gradient_limit=math.inf, experience=1, extremes=0
     ),

@@ -89,6 +89,7 @@ class LearningMethod(NamedTuple):
         squared: whether the loss reports δ² as ``td_error``, and not |δ|.
         normalised: whether the layers of the critics are normalised over a batch.
         relaxed: whether a critic without targets takes only the share τ of each of its steps.
+        draws: whether the loss draws random numbers.
     """
 
     make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
@@ -98,6 +99,7 @@ class LearningMethod(NamedTuple):
     squared: bool = True
     normalised: bool = False
     relaxed: bool = False
+    draws: bool = True
 
 
 def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, target: bool = True) -> LossModule:
@@ -124,8 +126,8 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
 
 
 METHODS: dict[str, LearningMethod] = {
-    "ddpg": LearningMethod(ddpg_loss, delay=0),
-    "relaxed_ddpg": LearningMethod(functools.partial(ddpg_loss, target=False), delay=0, relaxed=True),
+    "ddpg": LearningMethod(ddpg_loss, delay=0, draws=False),
+    "relaxed_ddpg": LearningMethod(functools.partial(ddpg_loss, target=False), delay=0, relaxed=True, draws=False),
     "td3": LearningMethod(td3_loss, critics=2, delay=2),
     "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
     "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
@@ -321,7 +323,10 @@ class ActorCritic:
 
     @contextlib.contextmanager
     def _drawing(self) -> Iterator[None]:
-        """TorchRL's losses draw from the global generator, which the learner's own generator seeds here."""
+        """Let a loss of TorchRL draw from the global generator, which the learner's own generator seeds."""
+        if not self.method.draws:
+            yield
+            return
         device = self.generator.device
         seed = torch.randint(2**31, (), generator=self.generator, device=device)
         with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):

@@ -207,9 +207,9 @@ class MultiStart:
     that have flown and are expected to cost least. Where the twin is wrong, what has flown stays as it is if it is
     expected to cost less than every plan.
 
-    Note: the paper keeps every plan, as ``accepts="every"`` does. Here a plan made on N_z winds is compared with the previous
-    policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another wind. State
-    feedback plans while it acts, so that there is nothing to compare.
+    Note: the paper keeps every plan, as ``accepts="every"`` does. Here a plan made on N_z winds is compared with the
+    previous policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another
+    wind. State feedback plans while it acts, so that there is nothing to compare.
 
     Random policies have random numbers of their own, so that a training whose plan they do not improve is the same
     without them.
@@ -439,6 +439,7 @@ class MakePlan(Step):
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         policy, virtual = self.planning.planner.policy, self.planning.virtual
         weights = weight_vector(policy)
-        planned_on, judged_on = virtual.draw(self.count, recorded=self.recorded), virtual.draw(self.judged)
+        planned_on = virtual.draw(self.count, recorded=self.recorded)
+        judged_on = virtual.draw(self.judged) if self.planning.judges else planned_on
         report = self.planning.plan(int(episode["number"]) + 1, planned_on, judged_on)
         return merged(episode, report).set(("weight_changes", "model_based"), weight_change(policy, weights))

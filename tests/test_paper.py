@@ -1,0 +1,48 @@
+"""``recipes/paper.py``, the paper's algorithm on one screen, and the preset of the same name."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.user_code import module_of
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+SHORT = {"wind_turbine": 20.0, "flapping_wing": 0.05, "cryogenic_tank": 3000.0}
+ITERATIONS = ("--twinning.learner.critic-iterations", "70", "--twinning.learner.actor-iterations", "60")
+WORDS = ("--preset", "paper", "--seed", "3", "--unseen", "2", "--untrained", "0", "--no-figures", *ITERATIONS)
+REFEREE = ("--twinning.referee.patience", "0", "--twinning.referee.clone-patience", "0")
+
+
+@pytest.mark.parametrize("referee", [(), REFEREE], ids=["few episodes", "at once"])
+@pytest.mark.parametrize("plant", SHORT)
+def test_the_recipe_and_the_preset_are_one_algorithm(plant, referee, tmp_path):
+    """Over episodes with and without exploration, a change of roles and a clone."""
+    recipe, count = load_recipe(RECIPES / f"{plant}.py"), "4" if referee else "2"
+    options = (*WORDS, *referee, "--episodes", count, "--horizon", str(SHORT[plant]), "--log-dir", str(tmp_path))
+    config = from_command_line(recipe.Config, options)
+    trained = Run(config, config.plant()).train()["episodes"]
+    written = list(module_of(RECIPES / "paper.py").twinning(config))
+    assert len(written) == len(trained) == int(count)
+    for ours, its in zip(written, trained, strict=True):
+        assert ours.pop("event") == its["event"]
+        assert ours == pytest.approx({name: its[name] for name in ours}, rel=1e-6)
+    events = {episode["event"] for episode in trained}
+    assert events == {"keep"} if not referee else events & {"swap", "clone"}
+
+
+def test_it_is_one_screen_with_three_options():
+    text = (RECIPES / "paper.py").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 250
+    assert list(module_of(RECIPES / "paper.py").Config.__dataclass_fields__) == ["plant", "seed", "episodes"]
+
+
+@pytest.mark.slow
+def test_it_runs_as_printed():
+    done = subprocess.run(
+        [sys.executable, RECIPES / "paper.py", "--episodes", "1"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("episode 1: real_cost ") and done.stdout.endswith("keep\n")
