@@ -136,7 +136,7 @@ PACKAGES = {
     "tensorboard": "tensorboard",
 }
 """The package of each program that ``uv run`` starts."""
-FILES = [".ci/run", ".pre-commit-config.yaml", "pyproject.toml", "tests/fuzz.py", "tests/test_fault_campaign.py"]
+FILES = [".ci/run", ".ci/nightly", ".pre-commit-config.yaml", "pyproject.toml", "tests/fuzz.py", "tests/test_fault_campaign.py"]
 
 
 def test_a_command_asks_for_the_groups_that_have_its_program():
@@ -177,6 +177,6 @@ def direct_of(extra, extras):
 
 def test_one_word_for_the_folder_of_the_results():
     """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "compare", "export", "record_log"}
+    without = {"benchmark", "compare", "export", "paper", "record_log"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

@@ -25,6 +25,7 @@ from rt_torchrl.trajectories.rollout import Engine
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""
 Preset = Literal["default", "paper", "neural", "mpc"]
+"""Name of what the options of a training are by default."""
 STARTS = ("random", "controller", "mpc")
 """Values of the option ``start`` that name no file."""
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
