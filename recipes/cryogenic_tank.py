@@ -224,7 +224,8 @@ def animate(snapshot: "Snapshot", path: Path) -> None:
     save_animation(snapshot, path)
 
 
-def main(config: Config) -> None:
+def main(config: Config, **parts: Any) -> None:
+    """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
     Run(
@@ -235,6 +236,7 @@ def main(config: Config) -> None:
         baselines=VALVES,
         first=PIValve,
         animate=animate,
+        **parts,
     ).train()
 
 

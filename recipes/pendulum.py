@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from rt_torchrl import begin_loading
 
@@ -60,7 +60,8 @@ class Config(RunConfig):
         return Pendulum(horizon=self.horizon, gravity=self.gravity, guess=self.guess)
 
 
-def main(config: Config) -> None:
+def main(config: Config, **parts: Any) -> None:
+    """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     # Here, because --help need not wait for TorchRL.
     from rt_torchrl import Run
     from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
@@ -70,7 +71,8 @@ def main(config: Config) -> None:
     plant = config.plant()
     known = plant.closure if config.judged_on == "plant" else None
     device = require_device(config.device)
-    Run(config, plant, env=partial(gymnasium_pendulum, plant, seed=config.seed, closure=known, device=device)).train()
+    env = partial(gymnasium_pendulum, plant, seed=config.seed, closure=known, device=device)
+    Run(config, plant, env=env, **parts).train()
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import contextlib
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from rt_torchrl import begin_loading
 
@@ -80,7 +80,8 @@ def server_of(config: Config):
     return ServerProcess(config.plant(), config.safe, **options)
 
 
-def main(config: Config) -> None:
+def main(config: Config, **parts: Any) -> None:
+    """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run, served_system  # here, because --help need not wait for TorchRL
 
     if config.serve:
@@ -96,7 +97,7 @@ def main(config: Config) -> None:
         closure=plant.closure,
     )
     with contextlib.nullcontext() if config.connect else server_of(config):
-        Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController).train()
+        Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController, **parts).train()
     return None
 
 

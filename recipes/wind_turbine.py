@@ -205,7 +205,8 @@ def animate(snapshot: "Snapshot", path: Path) -> None:
     save_animation(snapshot, path)
 
 
-def main(config: Config) -> None:
+def main(config: Config, **parts: Any) -> None:
+    """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
     from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 
@@ -216,7 +217,7 @@ def main(config: Config) -> None:
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     believed = config.believed()
     drawing = {"plant_figures": plant_figures, "animate": animate}
-    Run(config, plant, believed=believed, first=JonkmanController, **drawing, **system).train()
+    Run(config, plant, believed=believed, first=JonkmanController, **drawing, **system, **parts).train()
 
 
 if __name__ == "__main__":

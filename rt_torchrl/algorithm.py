@@ -33,6 +33,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
+from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.control.predictive_control import PredictiveControl
@@ -50,7 +51,7 @@ from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, episode_report, findings, merged, on_device
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
-from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
+from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operation import Operation, system_of
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -83,6 +84,8 @@ class ReinforcementTwinning(TensorDictSequential):
         planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
         referee: referee of step 6; by default that of ``config.referee``.
         first: what is known beforehand, such as :class:`FirstController`; None begins with the policies as they are.
+        make_collector: function of the real system, the live policy and the plant that makes the TorchRL collector of
+            step 1; a batch is a whole episode. An :class:`Operation` has its own.
         make_policy: function that draws a random policy like ``model_based``; by default that of the plant.
 
     Raises:
@@ -103,7 +106,7 @@ class ReinforcementTwinning(TensorDictSequential):
     belief: Belief
     flights: RealFlights
     actor: LivePolicy
-    collector: Operation | EpisodeCollector | FlightCollector
+    collector: Operation | BaseCollector
     clearance: Clearance
     assimilation: Assimilation
     planning: MultiStart
@@ -125,6 +128,7 @@ class ReinforcementTwinning(TensorDictSequential):
         planner: Planner | None = None,
         referee: Referee | None = None,
         first: Start | None = None,
+        make_collector: MakeCollector = collector_of,
         make_policy: Callable[[torch.Generator], nn.Module] | None = None,
     ):
         policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
@@ -149,8 +153,9 @@ class ReinforcementTwinning(TensorDictSequential):
         corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
         belief, system = Belief(policies, virtual, corrects=corrects), system_of(env)
         actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)
-        collector = env if isinstance(env, Operation) else collector_of(env, actor, twin.plant)
-        flights = RealFlights(env, actor, lambda: collector.rollout(), twin.plant, config.least_sound)
+        collector = env if isinstance(env, Operation) else make_collector(env, actor, twin.plant)
+        rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
+        flights = RealFlights(env, actor, rollout, twin.plant, config.least_sound)
         clearance = Clearance(system, policies, virtual, config.limits)
         interact = Interact(env, policies, flights, clearance, belief, config, judged)
         assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=fed_back)

@@ -136,7 +136,14 @@ PACKAGES = {
     "tensorboard": "tensorboard",
 }
 """The package of each program that ``uv run`` starts."""
-FILES = [".ci/run", ".ci/nightly", ".pre-commit-config.yaml", "pyproject.toml", "tests/fuzz.py", "tests/test_fault_campaign.py"]
+FILES = [
+    ".ci/run",
+    ".ci/nightly",
+    ".pre-commit-config.yaml",
+    "pyproject.toml",
+    "tests/fuzz.py",
+    "tests/test_fault_campaign.py",
+]
 
 
 def test_a_command_asks_for_the_groups_that_have_its_program():

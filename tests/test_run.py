@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
+from torchrl.collectors import Collector
 
 from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
@@ -19,7 +22,9 @@ from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
-from rt_torchrl.steps.plan import MakePlan
+from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
+from rt_torchrl.steps.plan import MakePlan, make_planner
+from rt_torchrl.steps.switch import make_referee
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
@@ -350,3 +355,40 @@ def test_the_confidence_interval_covers_the_mean_as_often_as_it_says():
     # 95 % nominal; a percentile bootstrap of 40 samples covers about 94 %. 200 trials have a deviation of 1.6 %, so
     # 89 % is three of them below.
     assert covered / 200 >= 0.89
+
+
+def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
+    """Each is made once, and a run of parts like the default ones is the default run, by TorchRL's collector, too."""
+    made = []
+
+    def noted(name, make):
+        def maker(*arguments, **named):
+            made.append(name)
+            return make(*arguments, **named)
+
+        return maker
+
+    def plain_collector(env, actor, plant):
+        acting = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
+        return Collector(env, acting, frames_per_batch=plant.n_steps, total_frames=-1, reset_at_each_iter=True)
+
+    def run(folder, **parts):
+        config = RunConfig(
+            episodes=3, log_dir=tmp_path / folder, compiled=False, unseen=3, figures=False, twinning=SMALL
+        )
+        return Run(config, LinearQuadratic(horizon=2.0), **parts).train()
+
+    parts = {
+        "learner": partial(ActorCritic, replay=noted("replay", LongTermMemory)),
+        "planner": make_planner,
+        "referee": make_referee,
+        "collector": plain_collector,
+    }
+    usual = run("usual")
+    own = run("own", **{name: noted(name, make) for name, make in parts.items()})
+    assert sorted(made) == ["collector", "learner", "planner", "referee", "replay"]
+    for ours, its in zip(own["episodes"], usual["episodes"], strict=True):
+        for name in ("real_cost", "J_p", "J_a_model_based", "J_a_model_free", "td_error"):
+            assert ours[name] == pytest.approx(its[name], rel=1e-9), name
+    with pytest.raises(ValueError, match="replay belongs to ActorCritic"):
+        run("both", learner=ActorCritic, replay=LongTermMemory)

@@ -41,7 +41,11 @@ from rt_torchrl.runs.run_start import start_of, twin_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import of_each_role
-from rt_torchrl.steps.learn import ActorCritic, MakeLearner
+from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
+from rt_torchrl.steps.plan import MakePlanner, make_planner
+from rt_torchrl.steps.start import first_live
+from rt_torchrl.steps.switch import MakeReferee, make_referee
+from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -66,6 +70,14 @@ class Run:
         first: class of the controller that the real system has had so far, for ``start="controller"``.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
+        replay: function of ``config.twinning.learner.memory`` and ``generator=`` that makes the memory of
+            :class:`ActorCritic`, if there is no ``learner``.
+        planner: function of twin, policy, ``config.twinning.planner`` and ``generator=`` that makes the planner of step
+            5, a :class:`Planner`.
+        referee: function of ``config.twinning.referee`` and the role that starts live that makes the referee of step 6,
+            a :class:`Referee`.
+        collector: function of the real system, the live policy and the plant that makes the TorchRL collector of step
+            1, each of whose batches is a whole episode of batch size ``1 n``.
         callbacks: functions that see the entries of all episodes after each one, and may end the training; see
             :data:`Callback`.
         animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
@@ -88,11 +100,17 @@ class Run:
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
-        learner: MakeLearner = ActorCritic,
+        learner: MakeLearner | None = None,
+        replay: MakeReplay | None = None,
+        planner: MakePlanner = make_planner,
+        referee: MakeReferee = make_referee,
+        collector: MakeCollector = collector_of,
         callbacks: Sequence[Callback] = (),
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
+        if learner is not None and replay is not None:
+            raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
         self.drawing = Drawing(plant_figures, animate)
@@ -114,7 +132,8 @@ class Run:
             if real is None:
                 make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
             system = real or simulated(plant, config, first, device=device, compiled=compiled)
-            self._make_algorithm(system, make_env, physics, learner, device=device, compiled=compiled)
+            makers = (learner or functools.partial(ActorCritic, replay=replay), planner, referee, collector)
+            self._make_algorithm(system, make_env, physics, *makers, device=device, compiled=compiled)
             self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
             self._real, self._first, self._device = real, first, device
             made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
@@ -134,6 +153,9 @@ class Run:
         make_env: Callable[[], EnvBase] | None,
         physics: Plant,
         make_learner: MakeLearner,
+        planner: MakePlanner,
+        referee: MakeReferee,
+        collector: MakeCollector,
         *,
         device: torch.device,
         compiled: bool,
@@ -146,16 +168,20 @@ class Run:
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
         acting = acting_by_name(policies, first)
-        learner = make_learner(physics, policies["model_free"], config.twinning.learner, generator=generator)
+        table, twin = config.twinning, twin_of(config, physics, closure, first, compiled=compiled)
+        learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         self.algorithm = ReinforcementTwinning(
             operation_of(config, env, make_env, physics, acting, folder=self.folder) if config.asynchronous else env,
-            twin_of(config, physics, closure, first, compiled=compiled),
+            twin,
             model_free=policies["model_free"],
             model_based=policies["model_based"],
-            config=config.twinning,
+            config=table,
             generator=generator,
             learner=learner,
+            planner=planner(twin, policies["model_based"], table.planner, generator=generator),
+            referee=referee(table.referee, first_live(table.arm, first)),
             first=first,
+            make_collector=collector,
             make_policy=self.make_policy,
         )
         # Copies made after the algorithm know its learner's critic, where model predictive control needs one.

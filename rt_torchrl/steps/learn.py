@@ -220,6 +220,8 @@ class ActorCritic:
         config: parameters of step 2.
         generator: source of the critics' initial weights and of the samples.
         method: the method, for a loss of one's own; by default the one that ``config.algorithm`` names.
+        replay: function of ``config.memory`` and ``generator=`` that makes the memory, with the methods of
+            :class:`LongTermMemory`.
 
     Raises:
         ValueError: if ``return_steps`` exceeds an episode of the plant.
@@ -233,6 +235,7 @@ class ActorCritic:
         *,
         generator: torch.Generator,
         method: LearningMethod | None = None,
+        replay: "MakeReplay | None" = None,
     ):
         if config.return_steps > plant.n_steps:
             raise ValueError(
@@ -242,7 +245,7 @@ class ActorCritic:
         self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
         self.method = method or METHODS[config.algorithm]
         self.batch_size = min(config.batch_size, plant.n_steps)
-        self.memory = LongTermMemory(config.memory, generator=generator)
+        self.memory = (replay or LongTermMemory)(config.memory, generator=generator)
         stochastic, n_a = self.method.stochastic, len(plant.actions)
         self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
         widths = (len(plant.observations) + n_a, *config.critic_hidden)
@@ -719,6 +722,10 @@ class LongTermMemory:
             index = self.buffer.extend(transitions.unflatten_keys("."))
             self._prioritise(index, state["priorities"].cpu())
             self._generator.set_state(state["generator"].cpu())
+
+
+MakeReplay = Callable[..., LongTermMemory]
+"""Function of a :class:`LongTermMemoryConfig` and ``generator=`` that makes a memory."""
 
 
 class LeastPriorityWriter(Writer):

@@ -190,6 +190,15 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
     )
 
 
+@runtime_checkable
+class MakePlanner(Protocol):
+    """A function that makes the planner of step 5; :func:`make_planner` describes the arguments."""
+
+    def __call__(
+        self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator
+    ) -> Planner: ...
+
+
 class Plan(NamedTuple):
     """Weights that a descent ended at, what they cost on other virtual episodes, and the report of the descent."""
 

@@ -156,6 +156,10 @@ def make_referee(config: RefereeConfig, live: Role) -> Referee:
     return DecisionTree(config, live) if config.rule == "decision_tree" else ExpectedCost(config, live)
 
 
+MakeReferee = Callable[[RefereeConfig, Role], Referee]
+"""Function of a configuration and the role that starts live that makes the referee of step 6."""
+
+
 class Switch(Step):
     """Step 6: the referee decides by what both policies cost over the same N virtual episodes.
 

@@ -6,7 +6,7 @@ data are the same.
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import cast
 
 import torch
@@ -229,6 +229,11 @@ def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollec
     if type(env) is PlantEnv:  # a subclass may override any part of a step
         return FlightCollector(env, actor)
     return EpisodeCollector(env, actor, plant)
+
+
+MakeCollector = Callable[[EnvBase, LivePolicy, Plant], BaseCollector]
+"""Function of the real system, the live policy and the plant that makes a collector, each of whose batches is a whole
+episode of batch size ``1 n``."""
 
 
 def pass_over(env: EnvBase) -> None:
