@@ -313,7 +313,7 @@ def test_a_callback_ends_the_training_and_its_results_are_written(stopped):
 
 def test_the_csv_logger_has_the_curves_and_the_final_costs(stopped):
     folder, metrics, _ = stopped
-    (curve,) = (folder / "csv" / "scalars").rglob("real episode (live policy).csv")
+    (curve,) = (folder / "csv" / "scalars" / "cost").glob("real episode (live policy).csv")
     rows = [(int(step), float(value)) for step, value in csv.reader(curve.open())]
     assert rows == [(k, pytest.approx(episode["real_cost"])) for k, episode in enumerate(metrics["episodes"])]
     (final,) = (folder / "csv" / "scalars" / "final").glob("J_a live.csv")

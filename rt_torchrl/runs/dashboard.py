@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from rt_torchrl.runs.summary import on_the_twin
+from rt_torchrl.steps.config import Role
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
@@ -52,6 +54,15 @@ TAGS = {
 """Tag of each scalar entry of an episode's record."""
 
 
+GROUPS = {
+    "hypothesis/": "hypotheses/weight/",
+    "misfit/": "hypotheses/misfit/",
+    "rms/": "twin/rms/",
+    **{kind: kind for kind in ("faults/", "violations/", "excess/", "multiplier/")},
+}
+"""Tags of entries of which an episode has several, by what they begin with."""
+OVER_THE_FIRST = ("real_cost", "J_p", "J_a_model_based", "J_a_model_free")
+"""Costs that are shown over that of the first episode, too, as the paper shows them."""
 COSTS = [
     TAGS[key] for key in ("real_cost", "J_a_model_based", "J_a_model_free", "J_a_unseen", "J_a_unseen_on_the_twin")
 ]
@@ -94,35 +105,56 @@ class Dashboard:
         shown = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in options.items()}
         for part in hparams(shown, final):
             self._writer._get_file_writer().add_summary(part)
+        unseen = summary["unseen"]
+        each = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
+        for name, values in each.items():
+            if np.isfinite(values).all():
+                self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(values), 0)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
-    def episode(self, record: Mapping[str, Any]) -> None:
-        """Write the scalars of one episode.
+    def episode(self, record: Mapping[str, Any], first: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
+        """Write the scalars of one episode, and the weights after it.
 
         Args:
             record: entry of the episode in ``metrics.json``.
+            first: that of the first episode, over whose costs the curves of ``cost over the first`` are.
+            policies: both policies by role.
         """
-        step = record["episode"]
+        step, live = record["episode"], record["live"].replace("_", "-")
         for key, tag in TAGS.items():
             if key in record:
                 self._scalar(tag, record[key], step)
+        self._scalar(f"cost/real episode ({live})", record["real_cost"], step)
+        for key in OVER_THE_FIRST:
+            if first.get(key) and np.isfinite(first[key]):
+                self._scalar(f"cost over the first/{TAGS[key].split('/')[1]}", record[key] / first[key], step)
+        self._weights(record, policies)
         self._scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
         for event in ("swap", "clone"):
             self._scalar(f"switch/{event}", float(record.get("event") == event), step)
-        for key in record:
-            if key.startswith(("hypothesis/", "misfit/")):
-                self._scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
-            elif key.startswith("rms/"):
-                self._scalar(f"twin/{key}", record[key], step)
-        self._texts(record, step)
-        for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
-            self._scalar(key, record[key], step)
+        self._texts(record)
+        for key, value in record.items():
+            for prefix in (prefix for prefix in GROUPS if key.startswith(prefix)):
+                self._scalar(key.replace(prefix, GROUPS[prefix]), value, step)
         for name, seconds in record["seconds"].items():
             self._scalar(f"seconds/{name}", seconds, step)
 
-    def _texts(self, record: Mapping[str, Any], step: int) -> None:
+    def _weights(self, record: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
+        """Write the closure's coefficients, or the weights of a perceptron, and those of both policies."""
+        step = record["episode"]
+        for name, weight in (record["closure"] or {}).items():
+            if isinstance(weight, float):
+                self._scalar(f"closure/{name}", weight, step)
+            else:
+                self._writer.add_histogram(f"closure/{name}", np.ravel(weight), step)
+        for role, policy in policies.items():
+            for name, values in policy.named_parameters():
+                self._writer.add_histogram(f"weights of {role.replace('_', '-')}/{name}", values, step)
+
+    def _texts(self, record: Mapping[str, Any]) -> None:
         """Write what an episode says in words: the alarm, the hypothesis that is believed, and faults."""
+        step = record["episode"]
         for tag, key in (("alarm", "warning"), ("believed", "believed")):
             if record.get(key):
                 self._writer.add_text(tag, str(record[key]), step)

@@ -99,7 +99,7 @@ def summarise(
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
         **over_untrained(after, untrained),
-        "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on}
+        "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on, "J_p_each": J_p.tolist()}
         | {name: mean_with_confidence(values) for name, values in means.items()}
         | results(unseen, judged),
         "cost_of_learning": cost_of_learning(episodes),

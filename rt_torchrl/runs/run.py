@@ -299,7 +299,7 @@ class Run:
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
-        dashboard.episode(record)
+        dashboard.episode(record, self.episodes[0], self.algorithm.policies)
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             safe_point()
