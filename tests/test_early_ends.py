@@ -175,9 +175,10 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
 
 
-def test_windows_count_what_an_end_costs():
+def test_windows_count_what_an_end_costs(monkeypatch):
     plant = Falling()
-    short = ShortHorizonConfig(window=5, critic_hidden=(8,), discount=0.9, mixing=0.7)
+    monkeypatch.setattr(ShortHorizon, "mixing", 0.7)
+    short = ShortHorizonConfig(window=5, discount=0.9)
     generator = torch.Generator().manual_seed(1)
     planning = PlannerConfig(short_horizon=short)
     plan = ShortHorizon(DigitalTwin(plant, plant.closure), LinearGain(WEAK), planning, generator=generator)
@@ -197,7 +198,7 @@ def test_windows_count_what_an_end_costs():
 
 def test_plans_over_short_windows_keep_a_rod_that_would_fall():
     plant = Falling()
-    short = ShortHorizonConfig(window=10, critic_hidden=(32, 32), policy_rate=2e-2)
+    short = ShortHorizonConfig(window=10, policy_rate=2e-2)
     planning = PlannerConfig(short_horizon=short, iterations=6)
     policy = LinearGain(WEAK)
     plan = ShortHorizon(DigitalTwin(plant, plant.closure), policy, planning, generator=torch.Generator().manual_seed(1))

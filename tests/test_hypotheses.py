@@ -242,8 +242,6 @@ def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
     mean = 0.25 * parts()[0] + 0.75 * parts()[1]
     torch.testing.assert_close(twin.cost(policy, *episodes), mean)
     torch.testing.assert_close(slope(twin.cost(policy, *episodes)), slope(0.25 * parts()[0] + 0.75 * parts()[1]))
-    twin.risk = 0.5
-    torch.testing.assert_close(twin.cost(policy, *episodes), 0.5 * mean + 0.5 * max(parts()))
     assert isinstance(assimilation, EnsembleAssimilation)
 
 
@@ -284,20 +282,19 @@ def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
     torch.testing.assert_close(flown.states, expected.states[..., :2])
 
 
-def kept(misfits, **options):
-    config = HypothesesConfig(**options)
-    return set(counting(evidence(misfits, config), config.least))
+def kept(misfits):
+    return set(counting(evidence(misfits)))
 
 
 def test_weights_ask_for_evidence():
-    shares = evidence({ALONE: 1.0, "lags": 0.95}, HypothesesConfig())
+    shares = evidence({ALONE: 1.0, "lags": 0.95})
     assert shares == {ALONE: 1.0, "lags": pytest.approx(0.01 / 0.95**6)}
     assert kept({ALONE: 1.0, "lags": 0.7}) == {ALONE}
     assert kept({ALONE: 1.0, "lags": 0.65}) == {ALONE, "lags"}
     assert kept({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}) == {"lags", "late"}
     assert kept({ALONE: float("inf"), "lags": float("inf")}) == {ALONE}
     assert kept({ALONE: 0.0, "lags": 0.0}) == {ALONE}
-    assert kept({ALONE: 1.0, "lags": float("inf")}, least=0.0) == {ALONE}
+    assert kept({ALONE: 1.0, "lags": float("inf")}) == {ALONE}
 
 
 def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(monkeypatch):
@@ -376,11 +373,9 @@ def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
 
 
-def test_the_worst_hypothesis_counts_as_the_parameters_say():
-    """Also in an ensemble of one's own, which the algorithm is given."""
+def test_an_ensemble_of_ones_own_is_weighed():
     own = TwinEnsemble(PLANT, PLANT.closure, {"late": PLANT.suspects()["late"]}, {"late": PLANT.closure})
-    config = HypothesesConfig(risk=0.25)
-    assert make_assimilation(own, ASSIMILATION, config).ensemble is own and own.risk == 0.25
+    assert make_assimilation(own, ASSIMILATION, HypothesesConfig()).ensemble is own
 
 
 def test_the_state_is_kept():
@@ -422,9 +417,6 @@ def test_hypotheses_are_chosen_by_name():
         (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect 'inflow'; choose among 'late', 'lags'"),
         (lambda: HypothesesConfig(which="none", names=("late",)), r"which='automatic'"),
         (lambda: HypothesesConfig(call=float("nan")), r"call=nan"),
-        (lambda: HypothesesConfig(prior=0.0), r"prior=0.0"),
-        (lambda: HypothesesConfig(risk=1.0), r"risk=1.0.*\[0, 1\)"),
-        (lambda: HypothesesConfig(segment=1), r"segment=1.*at least 2"),
         (lambda: TwinEnsemble(PLANT, PLANT.closure, PLANT.suspects(), {}), r"equal names"),
         (
             lambda: TwinEnsemble(PLANT, PLANT.closure, {"x": LinearQuadratic(dt=0.2)}, {"x": PLANT.closure}),
@@ -440,13 +432,13 @@ def test_what_is_no_hypothesis_is_refused(make, message):
 @pytest.mark.parametrize("which", ["none", "automatic"])
 def test_options_are_those_of_the_algorithm(which, tmp_path):
     """They reach the twin and its step 4 through a run."""
-    hypotheses = HypothesesConfig(which=which, call=0.02, names=("late",) if which == "automatic" else (), risk=0.1)
+    hypotheses = HypothesesConfig(which=which, call=0.02, names=("late",) if which == "automatic" else ())
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses)
     options = {"compiled": False, "unseen": 2, "figures": False, "twinning": twinning}
     algorithm = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=2.0)).algorithm
     assert isinstance(algorithm.twin, TwinEnsemble) == (which == "automatic")
     if which == "automatic":
-        assert list(algorithm.twin.twins) == [ALONE, "late"] and algorithm.twin.risk == 0.1
+        assert list(algorithm.twin.twins) == [ALONE, "late"]
         assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called
 
 

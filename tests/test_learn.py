@@ -508,10 +508,11 @@ ERRORS = torch.tensor([0.0, 0.1, 0.5, 1.0, 2.0, 5.0, 0.3, 0.3], dtype=torch.floa
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
-def test_sampling_follows_the_priorities(alpha):
+def test_sampling_follows_the_priorities(alpha, monkeypatch):
     """P(i) ∝ (|δ_i| + tol)^α*, by a χ² test at 0.1 %; the draws are seeded, so the outcome is always the same."""
     tol = 0.05
-    found = memory(prioritisation=alpha, offset=tol)
+    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", tol)
+    found = memory(prioritisation=alpha)
     found.store(labelled(list(range(8))), -ERRORS)
     counts = torch.zeros(8)
     for _ in range(40):
@@ -521,9 +522,10 @@ def test_sampling_follows_the_priorities(alpha):
     assert chisquare(counts.numpy(), expected.numpy() * counts.sum().item() / expected.sum().item()).pvalue > 1e-3
 
 
-def test_importance_weights_undo_the_sampling():
+def test_importance_weights_undo_the_sampling(monkeypatch):
     """w_i = (P_min/P_i)^β: one for the least likely, and for β = 1 the weighted draw is uniform."""
-    found = memory(prioritisation=0.8, correction=0.7, offset=0.05)
+    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", 0.05)
+    found = memory(prioritisation=0.8, correction=0.7)
     found.store(labelled(list(range(8))), ERRORS)
     batch = found.sample(400)
     P = (ERRORS + 0.05) ** 0.8
@@ -532,8 +534,9 @@ def test_importance_weights_undo_the_sampling():
     torch.testing.assert_close(batch["priority_weight"].double(), expected, rtol=1e-5, atol=0)
 
 
-def test_refreshed_errors_change_the_sampling():
-    found = memory(prioritisation=1.0, offset=1e-6)
+def test_refreshed_errors_change_the_sampling(monkeypatch):
+    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", 1e-6)
+    found = memory(prioritisation=1.0)
     found.store(labelled([0.0, 1.0, 2.0]), torch.tensor([1.0, 0.0, 0.0]))
     assert (found.sample(200)["label"] == 0.0).all()
     batch = TensorDict({"index": torch.tensor([0, 2])}, batch_size=[2])
@@ -599,7 +602,7 @@ def test_an_episode_that_does_not_fit_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change", [{"capacity": 0}, {"prioritisation": 1.5}, {"prioritisation": -0.1}, {"correction": 2.0}, {"offset": 0.0}]
+    "change", [{"capacity": 0}, {"prioritisation": 1.5}, {"prioritisation": -0.1}, {"correction": 2.0}]
 )
 def test_wrong_parameters_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):

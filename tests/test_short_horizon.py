@@ -15,7 +15,7 @@ from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
+CONFIG = ShortHorizonConfig(window=10)
 
 
 def episodes(plant, count, seed):
@@ -28,8 +28,9 @@ def planner(plant, config=CONFIG, **kind):
     return ShortHorizon(twin, policy, planning, generator=seeded(1), **kind)
 
 
-def test_targets_are_discounted_sums():
-    plan = planner(LinearQuadratic(), dataclasses.replace(CONFIG, discount=0.9, mixing=0.7))
+def test_targets_are_discounted_sums(monkeypatch):
+    monkeypatch.setattr(ShortHorizon, "mixing", 0.7)
+    plan = planner(LinearQuadratic(), dataclasses.replace(CONFIG, discount=0.9))
     costs, seen = (torch.rand(3, n, *width, generator=seeded(n)).double() for n, width in ((5, ()), (6, (2,))))
     values = plan.target(seen)[..., 0].detach()
     for b in range(3):
@@ -128,7 +129,7 @@ def test_a_window_longer_than_an_episode_is_refused():
 
 @pytest.mark.parametrize(
     "options",
-    [{"window": -1}, {"discount": 1.0}, {"mixing": 0.0}, {"critic_iterations": 0}, {"policy_rate": 0.0}],
+    [{"window": -1}, {"discount": 1.0}, {"critic_iterations": 0}, {"policy_rate": 0.0}],
 )
 def test_bad_parameters_are_refused(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}="):

@@ -27,13 +27,11 @@ class LongTermMemoryConfig:
         capacity: number n_L of transitions that the memory keeps.
         prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
         correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
-        offset: number tol that is added to every |δ|.
     """
 
     capacity: int = 100_000
     prioritisation: float = 0.6
     correction: float = 0.4
-    offset: float = 1e-3
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -42,8 +40,6 @@ class LongTermMemoryConfig:
         for argument in ("prioritisation", "correction"):
             if not 0.0 <= getattr(self, argument) <= 1.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must lie in [0, 1].")
-        if not self.offset > 0:
-            raise ValueError(f"offset={self.offset} must be positive, or a transition could never be sampled.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,9 +138,6 @@ class ConstraintsConfig:
 
     Args:
         states: least and greatest value of states, by name, in their units; inf or -inf for no bound.
-        method: augmented_lagrangian for a price whose multipliers grow with every episode after whose plans the policy
-            leaves the bounds, until plans keep them; penalty for a fixed price of the squared excess, which bends plans
-            back but leaves some.
         weight: weight of the price, in units of J_a of the first policy that is planned.
 
     Raises:
@@ -152,7 +145,6 @@ class ConstraintsConfig:
     """
 
     states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    method: Literal["augmented_lagrangian", "penalty"] = "augmented_lagrangian"
     weight: float = 100.0
 
     def __post_init__(self) -> None:
@@ -171,37 +163,24 @@ class ShortHorizonConfig:
     Args:
         window: number of control intervals in a window; 0 plans over whole episodes instead, as in the paper.
         discount: discount factor γ per control interval.
-        mixing: weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ.
         critic_iterations: gradients of the critic for each window.
-        critic_hidden: widths of the critic's hidden layers.
-        target_rate: share of the distance to the critic that the target critic moves after each window.
         policy_rate: learning rate of the policy (Adam).
-        critic_rate: learning rate of the critic (Adam).
     """
 
     window: int = 0
     discount: float = 0.98
-    mixing: float = 0.95
     critic_iterations: int = 8
-    critic_hidden: tuple[int, ...] = (64, 64)
-    target_rate: float = 0.2
     policy_rate: float = 5e-3
-    critic_rate: float = 2e-3
 
     def __post_init__(self) -> None:
         check_options(self)
-        require_widths("critic_hidden", self.critic_hidden)
         for argument, least in (("window", 0), ("critic_iterations", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
         if not 0.0 <= self.discount < 1.0:
             raise ValueError(f"discount={self.discount} of the short horizon must lie in [0, 1).")
-        for argument in ("mixing", "target_rate"):
-            if not 0.0 < getattr(self, argument) <= 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must lie in (0, 1].")
-        for argument in ("policy_rate", "critic_rate"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be positive.")
+        if not self.policy_rate > 0.0:
+            raise ValueError(f"policy_rate={self.policy_rate} of the short horizon must be positive.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -397,9 +376,7 @@ class AssimilationConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class HypothesesConfig:
-    r"""Parameters of the hypotheses, whose weights are :math:`w_h \propto p_h (\epsilon_{min}/\epsilon_h)^\kappa`.
-
-    Here ε is the J_p with which a hypothesis replays the records.
+    """Parameters of the hypotheses.
 
     Args:
         which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), or ``none`` for the twin alone.
@@ -408,13 +385,6 @@ class HypothesesConfig:
             always.
         names: names of the suspects that are taken, also of those that are taken only by name
             (:meth:`Plant.further_suspects`); all of the others if there are none.
-        prior: prior weight p_h of every addition, as a share of that of the twin alone. A small one asks for evidence
-            before anything is added.
-        sharpness: exponent κ, which stands for the number of independent samples in the records.
-        least: weight, as a share of the greatest one, below which a hypothesis is left out of the plan.
-        segment: number of control intervals after which a replay begins again with what was read; by default a sixtieth
-            of an episode.
-        risk: share ρ of the worst hypothesis in the cost that is planned on, (1 − ρ) Σ w_h J_h + ρ max J_h.
 
     Raises:
         ValueError: if an argument is out of its range.
@@ -423,24 +393,11 @@ class HypothesesConfig:
     which: Literal["none", "automatic"] = "automatic"
     call: float = 0.05
     names: tuple[str, ...] = ()
-    prior: float = 0.01
-    sharpness: float = 6.0
-    least: float = 0.1
-    segment: int | None = None
-    risk: float = 0.0
 
     def __post_init__(self) -> None:
         check_options(self)
-        for argument in ("prior", "sharpness"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must be positive.")
-        for argument in ("least", "risk"):
-            if not 0.0 <= getattr(self, argument) < 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must lie in [0, 1).")
         if not self.call >= 0.0:
             raise ValueError(f"call={self.call} of the hypotheses must not be negative.")
-        if self.segment is not None and self.segment < 2:
-            raise ValueError(f"segment={self.segment} of the hypotheses must be at least 2 control intervals.")
         if self.names and self.which == "none":
             raise ValueError(f"names={self.names} of the hypotheses need which='automatic'; it is 'none'.")
 

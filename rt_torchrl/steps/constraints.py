@@ -1,7 +1,7 @@
 r"""The price of trajectories that leave bounds on states, beside J_a.
 
 With g the distance of a state beyond one of its bounds (negative within), in shares of the width between them, the
-augmented Lagrangian of Powell, Hestenes and Rockafellar and, with μ = 0, a penalty are
+augmented Lagrangian of Powell, Hestenes and Rockafellar is
 
 .. math::
     J_a + J_0\sum_i\overline{\frac{\max(0, \mu_i + \rho g_i)^2}{2\rho}}
@@ -30,7 +30,7 @@ class Constraints:
 
     Args:
         plant: plant of the twin.
-        config: bounds, method and weight.
+        config: bounds and weight.
 
     Raises:
         ValueError: if the plant has no such state.
@@ -66,10 +66,9 @@ class Constraints:
         """Raise the multipliers of an augmented Lagrangian by the excess of trajectories of the policy that stays."""
         shares = self.bounds.shares(flown.states[:, 1:])
         self._excess = shares.mean((0, 1)).tolist()
-        if self.config.method == "augmented_lagrangian":
-            beyond = (shares.sum((0, 1)) / (shares > 0.0).sum((0, 1)).clamp_min(1)).tolist()
-            raised = zip(self.multipliers, beyond, strict=True)
-            self.multipliers = [mu + self.config.weight * excess for mu, excess in raised]
+        beyond = (shares.sum((0, 1)) / (shares > 0.0).sum((0, 1)).clamp_min(1)).tolist()
+        raised = zip(self.multipliers, beyond, strict=True)
+        self.multipliers = [mu + self.config.weight * excess for mu, excess in raised]
 
     def report(self) -> dict[str, float]:
         """Mean excess of the policy that stays in shares of the width, and the multiplier, of each bounded state."""

@@ -639,6 +639,10 @@ def flat(module: GraphModule) -> Callable[..., Sequence[Tensor]]:
     return functools.partial(GraphModule(nn.Module(), graph).forward, *(held[name] for name in names))
 
 
+TOL = 1e-3
+"""Number tol that is added to every |δ|, so that every transition can be sampled."""
+
+
 class LongTermMemory:
     r"""The memory D_L, which samples transitions by priority.
 
@@ -699,7 +703,7 @@ class LongTermMemory:
         errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
         if not errors.isfinite().all():
             raise FloatingPointError("a TD error exceeds the range of single precision")
-        self._prioritise(index.cpu(), (errors + self._config.offset) ** self._config.prioritisation)
+        self._prioritise(index.cpu(), (errors + TOL) ** self._config.prioritisation)
 
     def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
         self._writer.priorities[index.numpy()] = priorities.numpy()

@@ -17,6 +17,7 @@ Source: Xu et al., *Accelerated policy learning with parallel differentiable sim
 """
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -55,6 +56,11 @@ class ShortHorizon:
 
     gradient_limit = 1.0
     moments = (0.7, 0.95)  # Adam's decay rates, which are short because the cost changes with every window
+    mixing = 0.95
+    """Weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ."""
+    critic_hidden: Sequence[int] = (64, 64)
+    critic_rate, target_rate = 2e-3, 0.2
+    """Learning rate of the critic, and the share of the distance to it that the target moves after each window."""
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator):
         short = config.short_horizon
@@ -67,10 +73,10 @@ class ShortHorizon:
             )
         self.twin, self.policy, self.iterations, self.config = twin, policy, config.iterations, short
         n_o = len(twin.plant.observations)
-        critic = mlp(n_o, short.critic_hidden, 1, generator=generator, activation=nn.SiLU)
+        critic = mlp(n_o, self.critic_hidden, 1, generator=generator, activation=nn.SiLU)
         self.critic = critic.to(generator.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self._critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=short.critic_rate, betas=self.moments)
+        self._critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=self.critic_rate, betas=self.moments)
         self.reference = 0.0
         self.restart()
 
@@ -181,7 +187,7 @@ class ShortHorizon:
             self._critic_optimiser.step()
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                slow.lerp_(fast, self.config.target_rate)
+                slow.lerp_(fast, self.target_rate)
 
     @torch.no_grad()
     def _targets(
@@ -191,7 +197,7 @@ class ShortHorizon:
         over: Bool[Tensor, "batch m"] | None = None,
     ) -> Float[Tensor, "batch n"]:
         """The critic's targets (1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), computed from the last interval."""
-        gamma, mixing = self.config.discount, self.config.mixing
+        gamma, mixing = self.config.discount, self.mixing
         values = self._values(seen, over)
         following, found = values[:, -1], []
         for cost, value in zip(costs.flip(1).unbind(1), values[:, 1:].flip(1).unbind(1), strict=True):

@@ -16,6 +16,12 @@ from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+PRIOR = 0.01
+"""Prior weight p_h of every addition, as a share of that of the twin alone: evidence comes before anything is added."""
+SHARPNESS = 6.0
+"""Exponent κ of the evidence, which stands for the number of independent samples in the records."""
+LEAST = 0.1
+"""Weight, as a share of the greatest one, below which a hypothesis is left out of the plan."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 
@@ -44,8 +50,7 @@ class EnsembleAssimilation(Assimilation):
     ):
         super().__init__(twin, config)
         self.ensemble, self.hypotheses = twin, hypotheses
-        self.segment = hypotheses.segment or max(2, twin.plant.n_steps // SHORT)
-        twin.risk = hypotheses.risk
+        self.segment = max(2, twin.plant.n_steps // SHORT)
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
         self.always, self.turns = always, Turns()
         self.misfits: dict[str, float] = {}
@@ -106,11 +111,11 @@ class EnsembleAssimilation(Assimilation):
         alone = misfit(self.ensemble.twins[ALONE], records, self.segment)
         misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
         self.misfits = {ALONE: alone} | misfits
-        shares = evidence(self.misfits, self.hypotheses)
+        shares = evidence(self.misfits)
         self.turns.rest(hopeless=shares[ALONE] < HOPELESS)
         for name, fit in self.fits.items():
             fit.turns.rest(hopeless=shares[name] < HOPELESS)
-        self.ensemble.weights = counting(shares, self.hypotheses.least)
+        self.ensemble.weights = counting(shares)
 
     def _misfit(self, fit: Fit, records: Sequence[Trajectory], generator: torch.Generator) -> float:
         if fit.turns.due():
@@ -165,19 +170,22 @@ class EnsembleAssimilation(Assimilation):
         self.turns.load_state_dict(state.get("alone", Turns().state_dict()))  # earlier versions fitted it always
 
 
-def counting(shares: dict[str, float], least: float) -> dict[str, float]:
-    """The weights of the hypotheses that are planned on; one without any weight is not, whatever the least is."""
-    return {name: share for name, share in shares.items() if share > 0.0 and share >= least}
+def counting(shares: dict[str, float]) -> dict[str, float]:
+    """The weights of the hypotheses that are planned on."""
+    return {name: share for name, share in shares.items() if share >= LEAST}
 
 
-def evidence(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, float]:
-    """Weights of all hypotheses as shares of the greatest one; the twin alone has all if none replays the records."""
+def evidence(misfits: dict[str, float]) -> dict[str, float]:
+    r"""Weights :math:`w_h \propto p_h (\epsilon_{min}/\epsilon_h)^\kappa` as shares of the greatest one.
+
+    ε is the J_p with which a hypothesis replays the records. The twin alone has all weight if none replays them.
+    """
     least = min(misfits.values())
     if not least < float("inf"):
         return {name: float(name == ALONE) for name in misfits}
     tiny = 1e-300  # a misfit of zero is perfect, as is another one
     weights = {
-        name: (1.0 if name == ALONE else config.prior) * ((least + tiny) / (value + tiny)) ** config.sharpness
+        name: (1.0 if name == ALONE else PRIOR) * ((least + tiny) / (value + tiny)) ** SHARPNESS
         for name, value in misfits.items()
     }
     greatest = max(weights.values())

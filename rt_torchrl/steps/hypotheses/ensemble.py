@@ -62,7 +62,6 @@ class TwinEnsemble(DigitalTwin):
         for name, suspect in suspects.items():
             taken = able(engine, suspect)  # without compilation if it is another one, as everywhere
             self.twins[name] = DigitalTwin(suspect, closures[name], engine=taken, compiled=compiled and taken == engine)
-        self.risk = 0.0
         self.weights = {ALONE: 1.0}
 
     @property
@@ -153,8 +152,7 @@ class TwinEnsemble(DigitalTwin):
         """
         twins = [self.twins[name] for name in self._shares]
         each = torch.stack([twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins])
-        shares, worst = each.new_tensor(list(self._shares.values())), each[each.detach().mean(1).argmax()]
-        return (1.0 - self.risk) * (shares @ each) + self.risk * worst
+        return each.new_tensor(list(self._shares.values())) @ each
 
 
 def make_twin(
@@ -165,7 +163,7 @@ def make_twin(
     engine: Engine = "native",
     compiled: bool = False,
 ) -> DigitalTwin:
-    """The twin of a plant, with the hypotheses and the risk that a configuration asks for.
+    """The twin of a plant, with the hypotheses that a configuration asks for.
 
     Each hypothesis begins with a copy of the closure.
 
@@ -188,9 +186,7 @@ def make_twin(
         return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
     device = next((w.device for w in closure.parameters()), torch.device("cpu"))
     closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
-    twin = TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
-    twin.risk = config.risk
-    return twin
+    return TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
 
 
 def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
