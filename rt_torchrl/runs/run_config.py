@@ -308,8 +308,11 @@ class RunConfig:
         """The options that the run carries out, in which ``quick`` has replaced other options."""
         if not self.quick:
             return self
+        usual = self.twinning.learner
         learner = dataclasses.replace(
-            self.twinning.learner, critic_iterations=QUICK_ITERATIONS, actor_iterations=QUICK_ITERATIONS
+            usual,
+            critic_iterations=min(usual.critic_iterations, QUICK_ITERATIONS),
+            actor_iterations=min(usual.actor_iterations, QUICK_ITERATIONS),
         )
         twinning = dataclasses.replace(self.twinning, learner=learner)
         return dataclasses.replace(

@@ -1,0 +1,247 @@
+"""The figures of the paper's section 6 that have described axes or printed numbers, from trainings by its algorithm."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rt_torchrl import begin_loading
+
+if __name__ == "__main__":
+    begin_loading()
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from rt_torchrl import LoadedRun, check_options, load_run, main_of
+from rt_torchrl.figures.style import ROLES, TWIN, array, caption, legend_below, panels, role_name
+from rt_torchrl.steps.config import ROLES as POLICIES
+from rt_torchrl.study.sweep import seeded_runs, train_all
+
+RATIOS = {
+    "wind_turbine": {"J_p": (0.21, 0.08), "model_based": (0.08, 0.05), "model_free": (0.13, 0.12)},
+    "flapping_wing": {"J_p": (3.2e-2, 4.9e-2), "model_based": (0.418, 0.001), "model_free": (0.201, 0.045)},
+    "cryogenic_tank": {"J_p": (3.15e-4, 0.9e-4), "model_based": (0.447, 0.268), "model_free": (0.480, 0.315)},
+}
+"""Mean and deviation of costs after the training over costs before (paper, table of learning performances)."""
+SWITCHES = {"wind_turbine": 7, "flapping_wing": 4, "cryogenic_tank": 4}
+"""Episode after which the roles change first in the paper (figure 11)."""
+OF_A_RUN = {
+    "wind_turbine": ("power_and_speed", "policy_contours", "power_coefficient"),  # 00 and 14a, 13, 14b
+    "flapping_wing": ("states", "flight", "control_surfaces"),  # 16a, 17, 18
+    "cryogenic_tank": ("tank", "states", "policy_contours", "heat_exchanger"),  # 21, 22 a to c, 23
+}
+"""Figures that every training draws, by name, beside those below."""
+EPISODES = 5
+"""Number of unseen episodes in the figures of predictions."""
+START, HOURS = 540e3, 45.0
+"""Pressure that the paper's tank is vented from [Pa], and the time that it takes [h]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Train what is missing by ``--preset paper``, and draw the paper's figures beside its printed numbers.
+
+    Args:
+        plant: the plant.
+        seeds: seeds of the trainings.
+        jobs: number of trainings side by side, each on one thread; 0 for one on each core.
+        log_dir: folder of the trainings and, in ``PLANT/figures``, of the figures.
+    """
+
+    plant: Literal["wind_turbine", "flapping_wing", "cryogenic_tank"] = "wind_turbine"
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    jobs: int = 0
+    log_dir: Path = Path("runs/paper")
+
+    def __post_init__(self):
+        check_options(self)
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError(f"seeds={self.seeds} must name seeds, which are not negative.")
+
+
+def band(ax: Axes, curves: np.ndarray, colour: str, label: str) -> None:
+    """Mean over the seeds as a dashed line, and a standard deviation above and below, but not below all seeds."""
+    mean, deviation, episodes = curves.mean(0), curves.std(0), np.arange(1, curves.shape[1] + 1)
+    low = np.maximum(mean - deviation, curves.min(0))
+    ax.fill_between(episodes, low, mean + deviation, color=colour, alpha=0.2, linewidth=0)
+    ax.plot(episodes, mean, color=colour, linestyle="--", label=label)
+
+
+def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
+    """Figures 10 and 11: costs over the mean initial cost of the seeds, and which policy was live."""
+    start = np.mean([one["summary"]["unseen"]["J_a_before"]["mean"] for one in metrics])
+    start_of_twin = np.mean([one["episodes"][0]["J_p_before"] for one in metrics])
+
+    def curves(key: str, start: float = start) -> np.ndarray:
+        return np.array([[episode[key] for episode in one["episodes"]] for one in metrics]) / start
+
+    figure, axes = panels(3, title=f"{plant}: learning, {len(metrics)} seeds", size=(7.5, 9.0), sharex=True)
+    control, assimilation, live = axes.flat
+    band(control, curves("real_cost"), "0.3", "real episode (live policy)")
+    for role in POLICIES:
+        band(control, curves(f"J_a_{role}"), ROLES[role], f"{role_name(role)}, on the twin")
+        mean = RATIOS[plant][role][0]
+        control.axhline(mean, color=ROLES[role], linewidth=0.8, label=f"{role_name(role)} at the end, paper")
+    band(assimilation, curves("J_p", start_of_twin), TWIN, "twin")
+    assimilation.axhline(RATIOS[plant]["J_p"][0], color=TWIN, linewidth=0.8, label="at the end, paper")
+    for row, one in enumerate(metrics):
+        for role in POLICIES:
+            spans = [(k + 0.5, 1.0) for k, episode in enumerate(one["episodes"]) if episode["live"] == role]
+            live.broken_barh(spans, (row - 0.4, 0.8), facecolors=ROLES[role])
+    live.axvline(SWITCHES[plant] + 0.5, color="0.2", linestyle=":", label="first change of roles, paper")
+    live.set_xlabel("episode")
+    live.xaxis.set_major_locator(MaxNLocator(integer=True))
+    live.set_yticks(range(len(metrics)), [f"seed {one['seed']}" for one in metrics])
+    for ax, label in ((control, "J_a over its mean at the start"), (assimilation, "J_p over its mean at the start")):
+        ax.set_yscale("log")
+        caption(ax, label)
+    caption(live, "live policy")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
+    """Figures 15, 19 and 25: costs of both policies and of the twin on unseen episodes, of all seeds."""
+    unseen = [one["summary"]["unseen"] for one in metrics]
+    figure, axes = panels(1, 2, title=f"{plant}: unseen episodes of {len(unseen)} seeds", size=(9.0, 4.5))
+    violins = {role_name(role): [c for one in unseen for c in one["costs"][role]] for role in POLICIES}
+    for ax, found, label in (
+        (axes[0, 0], violins, "J_a on the real system"),
+        (axes[0, 1], {"twin": [c for one in unseen for c in one["J_p_each"]]}, "J_p"),
+    ):
+        values = [np.log10(np.maximum(one, 1e-300)) for one in found.values()]
+        ax.violinplot(values, showmedians=True)
+        ax.set_xticks(range(1, len(found) + 1), list(found))
+        caption(ax, f"log10 of {label}")
+    return figure
+
+
+@torch.no_grad()
+def prediction(run: LoadedRun) -> Figure:
+    """Figures 12b, 16b and 22 d to f: states of the twin against real ones, in unseen episodes of the live policy."""
+    believed, flown = run.twin.believed, [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
+    names = {name.split(" ")[0] for name in run.metrics["summary"]["twin"]["rms"]}
+    compared = [k for k, state in enumerate(run.plant.states) if state.name in names]
+    figure, axes = panels(
+        1, len(compared), title=f"{run.plant.name}: twin and reality", size=(4.2 * len(compared), 4.5)
+    )
+    for ax, k in zip(axes.flat, compared, strict=True):
+        signal, errors = run.plant.states[k], []
+        for one in flown:
+            again = believed.replay(one.states[None, 0], one.exogenous[None], one.actions[None]).states[0]
+            ax.plot(array(one.states[:, k]), array(again[:, k]), ".", color=TWIN, markersize=2, alpha=0.4)
+            errors.append(again[:, k] - one.states[:, k])
+        ends = [
+            min(float(one.states[:, k].min()) for one in flown),
+            max(float(one.states[:, k].max()) for one in flown),
+        ]
+        ax.plot(ends, ends, color="0.5", linewidth=1.0)
+        ax.set_xlabel("real")
+        caption(
+            ax,
+            f"twin's {signal.name.replace('_', ' ')} [{signal.unit}]",
+            f"RMS {torch.cat(errors).square().mean().sqrt():.2g}",
+        )
+    return figure
+
+
+@torch.no_grad()
+def power_over_wind(run: LoadedRun) -> tuple[Figure, str]:
+    """Figure 14b: the power coefficient at the wind speeds of unseen episodes, and its greatest mean."""
+    figure, ((ax,),) = panels(1, title="Power coefficient where the turbine operates", size=(6.5, 4.5))
+    winds, found = [], []
+    for seed in range(EPISODES):
+        flown = run.simulate(run.policy(run.live), seed=seed)
+        u = flown.exogenous[:, 0]
+        ratio = flown.states[:-1, 0] * run.plant.radius / u
+        winds.append(u)
+        found.append(run.plant.closure(torch.stack([ratio, flown.actions[:, 1]], -1)).squeeze(-1))
+    u, C_p = array(torch.cat(winds)), array(torch.cat(found))
+    ax.plot(u, C_p, ".", markersize=2, color=ROLES["model_based"], alpha=0.4)
+    edges = np.arange(np.floor(u.min()), np.ceil(u.max()) + 1.0)
+    means = [
+        C_p[(u >= low) & (u < low + 1.0)].mean() for low in edges[:-1] if ((u >= low) & (u < low + 1.0)).sum() > 50
+    ]
+    ax.set_xlabel("wind speed [m/s]")
+    caption(ax, "C_p [-]", f"greatest mean over 1 m/s {max(means):.2g}, paper 0.42")
+    return figure, f"greatest mean C_p over 1 m/s of wind: {max(means):.2g} (paper 0.42)"
+
+
+@torch.no_grad()
+def venting(run: LoadedRun) -> tuple[Figure, str]:
+    """Figure 21: the tank vented from 5.4 bar, and figure 21c, the flow over the pressure."""
+    start = run.plant.state_at(torch.tensor([START], dtype=torch.float64))
+    flown = run.simulate(run.policy(run.live), initial_state=start[0])
+    law = run.plant.closure
+    flow = 1e3 * run.plant.vent(flown.states[:-1], flown.actions, law).flow
+    hours = run.plant.dt / 3600.0 * np.arange(len(flow))
+    vented = array(run.plant.vented_mass(flown.states, flown.actions, law)[:-1])
+    figure, axes = panels(1, 3, title="Tank vented from 5.4 bar", size=(12.0, 4.0))
+    for ax, values, label in (
+        (axes[0, 0], 1e-3 * array(flown.states[:-1, 2]), "pressure [kPa]"),
+        (axes[0, 1], vented, "vented mass [kg]"),
+    ):
+        ax.plot(hours, values, color=ROLES[run.live])
+        ax.set_xlabel("time [h]")
+        caption(ax, label)
+    axes[0, 1].plot([HOURS], [87.0], "k+", markersize=10, label="paper")
+    axes[0, 2].plot(1e-3 * array(flown.states[:-1, 2]), array(flow), ".", markersize=2, color=ROLES[run.live])
+    axes[0, 2].set_xlabel("pressure [kPa]")
+    caption(axes[0, 2], "vent flow [g/s]", f"greatest {flow.max():.2g}, paper 0.63")
+    legend_below(figure, list(axes.flat))
+    arrived = hours[np.argmax(array(flown.states[:-1, 2]) <= 1.005 * run.plant.set_point)]
+    numbers = (
+        f"greatest flow {flow.max():.2g} g/s (paper 0.63), {np.interp(HOURS, hours, vented):.0f} kg in 45 h (paper 87)"
+    )
+    return figure, f"{numbers}; within 0.5 % of the set point after {arrived:.0f} h (paper: at it after 45)"
+
+
+def table(plant: str, metrics: list[dict[str, Any]]) -> str:
+    """The paper's table of learning performances, with its numbers beside."""
+    lines = [f"{plant}, {len(metrics)} seeds: cost on unseen episodes after the training over the cost before"]
+    keys = {"J_p": "J_p_ratio", **{role: f"J_a_ratio_{role}" for role in POLICIES}}
+    for name, key in keys.items():
+        found, (mean, deviation) = np.array([one["summary"][key] for one in metrics]), RATIOS[plant][name]
+        own = f"{found.mean():.3g} ± {found.std(ddof=1):.3g}, median {np.median(found):.3g}"
+        lines.append(f"  {name}: {own} (paper {mean:g} ± {deviation:g})")
+    first = [next((k + 1 for k, e in enumerate(one["episodes"]) if e["event"] == "swap"), None) for one in metrics]
+    lines.append(f"  first change of roles after episode: {', '.join(map(str, first))} (paper {SWITCHES[plant]})")
+    back = [one["seed"] for one in metrics if one["summary"]["live"] == "model_free"]
+    lines.append(f"  the model-free policy is live at the end with seeds: {', '.join(map(str, back)) or 'none'}")
+    return "\n".join(lines)
+
+
+def main(config: Config) -> None:
+    from rt_torchrl.figures import save_figure
+
+    folder = config.log_dir / config.plant
+    runs = seeded_runs(
+        Path(__file__).with_name(f"{config.plant}.py"), config.seeds, folder, ("--preset", "paper", "--no-figures")
+    )
+    train_all(runs, config.jobs)
+    metrics = [
+        json.loads((one.folder / "metrics.json").read_text(encoding="utf-8")) | {"seed": one.seed} for one in runs
+    ]
+    costs = [one["summary"]["unseen"][f"J_a_{one['summary']['live']}"]["mean"] for one in metrics]
+    run = load_run(runs[int(np.argsort(costs)[len(costs) // 2])].folder)  # the seed with the median cost
+    drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
+    drawn["prediction"] = prediction(run)
+    said = [table(config.plant, metrics)]
+    if config.plant != "flapping_wing":
+        name, draw = ("power_over_wind", power_over_wind) if config.plant == "wind_turbine" else ("venting", venting)
+        drawn[name], numbers = draw(run)
+        said.append(f"  {numbers}")
+    drawn |= {name: run.figure(name) for name in OF_A_RUN[config.plant]}
+    (folder / "figures").mkdir(exist_ok=True)
+    for name, figure in drawn.items():
+        save_figure(figure, folder / "figures" / f"{name}.png")
+    print("\n".join(said))
+    print(f"figures in {folder / 'figures'}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)
