@@ -35,6 +35,8 @@ OF_A_RUN = {
     "cryogenic_tank": ("tank", "states", "policy_contours", "heat_exchanger"),  # 21, 22 a to c, 23
 }
 """Figures that every training draws, by name, beside those below."""
+OPTIONS = ("--preset", "paper", "--no-figures")
+"""Options of the trainings."""
 EPISODES = 5
 """Number of unseen episodes in the figures of predictions."""
 START, HOURS = 540e3, 45.0
@@ -162,10 +164,8 @@ def power_over_wind(run: LoadedRun) -> tuple[Figure, str]:
         found.append(run.plant.closure(torch.stack([ratio, flown.actions[:, 1]], -1)).squeeze(-1))
     u, C_p = array(torch.cat(winds)), array(torch.cat(found))
     ax.plot(u, C_p, ".", markersize=2, color=ROLES["model_based"], alpha=0.4)
-    edges = np.arange(np.floor(u.min()), np.ceil(u.max()) + 1.0)
-    means = [
-        C_p[(u >= low) & (u < low + 1.0)].mean() for low in edges[:-1] if ((u >= low) & (u < low + 1.0)).sum() > 50
-    ]
+    bins = np.floor(u)
+    means = [C_p[bins == low].mean() for low in np.unique(bins) if (bins == low).mean() > 0.01]
     ax.set_xlabel("wind speed [m/s]")
     caption(ax, "C_p [-]", f"greatest mean over 1 m/s {max(means):.2g}, paper 0.42")
     return figure, f"greatest mean C_p over 1 m/s of wind: {max(means):.2g} (paper 0.42)"
@@ -219,9 +219,7 @@ def main(config: Config) -> None:
     from rt_torchrl.figures import save_figure
 
     folder = config.log_dir / config.plant
-    runs = seeded_runs(
-        Path(__file__).with_name(f"{config.plant}.py"), config.seeds, folder, ("--preset", "paper", "--no-figures")
-    )
+    runs = seeded_runs(Path(__file__).with_name(f"{config.plant}.py"), config.seeds, folder, OPTIONS)
     train_all(runs, config.jobs)
     metrics = [
         json.loads((one.folder / "metrics.json").read_text(encoding="utf-8")) | {"seed": one.seed} for one in runs

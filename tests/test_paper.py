@@ -40,6 +40,21 @@ def test_it_is_one_screen_with_three_options():
     assert list(module_of(RECIPES / "paper.py").Config.__dataclass_fields__) == ["plant", "seed", "episodes"]
 
 
+@pytest.mark.parametrize(
+    "plant", [pytest.param(name, marks=pytest.mark.slow) for name in SHORT if name != "wind_turbine"] + ["wind_turbine"]
+)
+def test_the_figures_of_the_paper_are_drawn_beside_its_numbers(plant, tmp_path, monkeypatch, capsys):
+    recipe = module_of(RECIPES / "paper_figures.py")
+    short = ("--horizon", str(SHORT[plant]), "--episodes", "2", "--unseen", "3", "--untrained", "0", *ITERATIONS)
+    monkeypatch.setattr(recipe, "OPTIONS", (*recipe.OPTIONS, *short))
+    recipe.main(recipe.Config(plant=plant, seeds=(0, 1), jobs=1, log_dir=tmp_path))
+    said = capsys.readouterr().out
+    assert f"{plant}, 2 seeds" in said and f"(paper {recipe.SWITCHES[plant]})" in said
+    assert ("paper 0.42" in said) == (plant == "wind_turbine") and ("paper 87" in said) == (plant == "cryogenic_tank")
+    drawn = {path.stem for path in (tmp_path / plant / "figures").iterdir()}
+    assert {"learning", "robustness", "prediction", *recipe.OF_A_RUN[plant]} <= drawn
+
+
 @pytest.mark.slow
 def test_it_runs_as_printed():
     done = subprocess.run(
