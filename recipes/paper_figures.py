@@ -110,10 +110,10 @@ def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
     """Figures 15, 19 and 25: costs of both policies and of the twin on unseen episodes, of all seeds."""
     unseen = [one["summary"]["unseen"] for one in metrics]
     figure, axes = panels(1, 2, title=f"{plant}: unseen episodes of {len(unseen)} seeds", size=(9.0, 4.5))
-    violins = {role_name(role): [c for one in unseen for c in one["costs"][role]] for role in POLICIES}
+    violins = {role_name(role): [c for one in unseen for c in one["costs"][role] if c is not None] for role in POLICIES}
     for ax, found, label in (
         (axes[0, 0], violins, "J_a on the real system"),
-        (axes[0, 1], {"twin": [c for one in unseen for c in one["J_p_each"]]}, "J_p"),
+        (axes[0, 1], {"twin": [c for one in unseen for c in one["J_p_each"] if c is not None]}, "J_p"),
     ):
         values = [np.log10(np.maximum(one, 1e-300)) for one in found.values()]
         ax.violinplot(values, showmedians=True)

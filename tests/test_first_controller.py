@@ -124,6 +124,10 @@ def test_a_run_begins_with_the_controller_once(tmp_path):
     first, second = metrics["episodes"]
     assert first["start_cost"] > 0.0 and "start_cost" not in second
     assert '"start": "controller"' in (tmp_path / "config.json").read_text()
+    assert (
+        metrics["summary"]["unseen"]["baselines"].keys() == {"PD"}
+        and len(metrics["summary"]["unseen"]["costs"]["PD"]) == 3
+    )
 
 
 def test_a_run_begins_at_random_without_being_asked(tmp_path):

@@ -108,7 +108,7 @@ class Dashboard:
         unseen = summary["unseen"]
         each = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
         for name, values in each.items():
-            if np.isfinite(values).all():
+            if None not in values:  # which stands for a cost that is not finite
                 self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(values), 0)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
@@ -127,7 +127,7 @@ class Dashboard:
                 self._scalar(tag, record[key], step)
         self._scalar(f"cost/real episode ({live})", record["real_cost"], step)
         for key in OVER_THE_FIRST:
-            if first.get(key) and np.isfinite(first[key]):
+            if key in record and first.get(key) and np.isfinite(first[key]):
                 self._scalar(f"cost over the first/{TAGS[key].split('/')[1]}", record[key] / first[key], step)
         self._weights(record, policies)
         self._scalar("switch/live is model-based", float(record["live"] == "model_based"), step)

@@ -67,7 +67,8 @@ class Run:
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure and ``config.real_unseen`` flights, a :class:`RealController`.
-        first: class of the controller that the real system has had so far, for ``start="controller"``.
+        first: class of the controller that the real system has had so far, for ``start="controller"``. It is judged
+            beside the policies wherever the unseen episodes are flown under the true closure.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
         replay: function of ``config.twinning.learner.memory`` and ``generator=`` that makes the memory of
@@ -123,6 +124,9 @@ class Run:
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
         physics = known_physics(config, plant, believed, real, first, baselines)
+        laws = dict(baselines or {})
+        if config.start == "controller" and first is not None and first not in laws.values():
+            laws |= {} if real is not None and real.closure is None else {first.__name__: first}
         self._start = start_of(config, physics, first)
         if threads := learner_threads(config):
             torch.set_num_threads(threads)
@@ -136,7 +140,7 @@ class Run:
             self._make_algorithm(system, make_env, physics, *makers, device=device, compiled=compiled)
             self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
             self._real, self._first, self._device = real, first, device
-            made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
+            made = {name: law(physics, compiled=compiled) for name, law in laws.items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []

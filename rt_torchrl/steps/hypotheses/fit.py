@@ -89,6 +89,11 @@ class Reread(Extension):
         readings = [Signal(symbol=s.symbol, name=f"read_{s.name}", unit=s.unit) for s in base.readings]
         self.inputs = (*base.inputs, *readings, Signal(symbol="r", name="is_read", unit="-"))
 
+    @property
+    def own_scheme(self) -> bool:
+        """Always: an interval that begins with readings is no integral of the vector field."""
+        return True
+
     def step(
         self,
         t: Float[Tensor, "*#batch"],

@@ -1,0 +1,99 @@
+"""What one episode of a default training calls: TorchRL's parts, torchdiffeq, and how much of this library."""
+
+import sys
+from pathlib import Path
+
+import torchdiffeq
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import BaseCollector
+from torchrl.data import TensorDictPrioritizedReplayBuffer
+from torchrl.objectives import DDPGLoss
+
+from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.run import Run
+
+ROOT = Path(__file__).parents[1]
+HERE = (str(ROOT / "rt_torchrl"), str(ROOT / "envs"))
+FUNCTIONS, FILES = 320, 45
+"""Greatest number of functions of this library in an episode, and of files that hold them."""
+
+
+def trained(folder, *words, seconds=50):
+    """A default training of the turbine of two short episodes."""
+    recipe = load_recipe(ROOT / "recipes" / "wind_turbine.py")
+    short = ("--episodes", "2", "--horizon", str(seconds), "--no-figures", "--untrained", "0", "--unseen", "2")
+    config = from_command_line(recipe.Config, [*short, "--log-dir", str(folder), *words])
+    run = Run(config, config.plant(), first=JonkmanController)
+    run.train()
+    return run
+
+
+def counted(monkeypatch, owner, name):
+    """Number of calls of a method from now on, as the length of a list."""
+    calls, method = [], getattr(owner, name)
+
+    def counting(*arguments, **named):
+        calls.append(name)
+        return method(*arguments, **named)
+
+    monkeypatch.setattr(owner, name, counting)
+    return calls
+
+
+def test_torchrl_is_in_the_path_that_runs_by_default(tmp_path, monkeypatch):
+    loss = counted(monkeypatch, DDPGLoss, "forward")
+    sample = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "sample")
+    refresh = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "update_tensordict_priority")
+    algorithm = trained(tmp_path).algorithm
+    assert isinstance(algorithm, TensorDictSequential) and isinstance(algorithm.collector, BaseCollector)
+    # TD errors of three flights, and one trace of the critic's iteration and of the policy's, replayed 400 times.
+    assert len(loss) == 3 + 2
+    assert len(sample) == 2 * 2 * 2  # of two episodes with two phases, fifty batches at once
+    assert len(refresh) == 3 + 2 * 2
+
+
+def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch):
+    calls = counted(monkeypatch, torchdiffeq, "odeint_adjoint")
+    trained(tmp_path / "native", seconds=10)
+    assert not calls
+    few = (
+        "--twinning.planner.iterations",
+        "1",
+        "--twinning.planner.realisations",
+        "1",
+        "--twinning.planner.starts",
+        "0",
+    )
+    few += (
+        "--twinning.assimilation.iterations",
+        "1",
+        "--twinning.virtual-episodes",
+        "1",
+        "--twinning.planner.extremes",
+        "0",
+    )
+    trained(tmp_path / "continuous", "--engine", "odeint_adjoint", "--compiled", "False", *few, seconds=6)
+    assert len(calls) > 8  # one for every control interval
+
+
+def test_an_episode_goes_through_few_functions(tmp_path, monkeypatch):
+    seen, episode = set(), ReinforcementTwinning.episode
+
+    def watched(algorithm, *arguments):
+        def note(frame, event, _):
+            code = frame.f_code
+            if event == "call" and code.co_filename.startswith(HERE) and not code.co_name.startswith("<"):
+                seen.add((code.co_filename, code.co_firstlineno))
+
+        if algorithm.episodes_done == 1:  # the first one traces
+            sys.setprofile(note)
+        try:
+            return episode(algorithm, *arguments)
+        finally:
+            sys.setprofile(None)
+
+    monkeypatch.setattr(ReinforcementTwinning, "episode", watched)
+    trained(tmp_path)
+    assert 150 < len(seen) <= FUNCTIONS and len({file for file, _ in seen}) <= FILES
