@@ -23,6 +23,8 @@ from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 Weights = dict[str, Tensor]
+SEVERAL = (1, 2, 4)
+"""Episodes in which plans have several starts; later ones gained nothing on eight systems."""
 STRIDE = 1_000_003
 """Difference of the seeds of the random policies of two episodes."""
 SEEDS = 2**63
@@ -210,11 +212,11 @@ class Plan(NamedTuple):
 class MultiStart:
     """Plans from several starts on some virtual episodes, and judges the plans on others; the best one stays.
 
-    A descent begins with the present weights. It begins with others, too, in the first episode, the second, the fourth
-    and so on, and where gradients explode in the first plan that gains nothing or is refused, the second, the fourth
-    and so on: with those before the imitation of a controller, with the best of some random policies, and with those
-    that have flown and are expected to cost least. Where the twin is wrong, what has flown stays as it is if it is
-    expected to cost less than every plan.
+    A descent begins with the present weights. It begins with others, too, in the episodes 1, 2 and 4, and where
+    gradients explode in the first plan that gains nothing or is refused, the second, the fourth and so on: with those
+    before the imitation of a controller, with the best of some random policies, and with those that have flown and are
+    expected to cost least. Where the twin is wrong, what has flown stays as it is if it is expected to cost less than
+    every plan.
 
     Note: the paper keeps every plan, as ``accepts="every"`` does. Here a plan made on N_z winds is compared with the
     previous policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another
@@ -364,7 +366,7 @@ class MultiStart:
         if not self.count or not isinstance(self.planner, WholeEpisodes):
             return False
         self._stalled = self._stalled + 1 if self.planner.stalled(plan.report) else 0
-        return episode.bit_count() == 1 or self._stalled.bit_count() == 1
+        return episode in SEVERAL or self._stalled.bit_count() == 1
 
     def _others(
         self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None
