@@ -177,7 +177,7 @@ def test_the_hooks_are_installed(clone):
 
 
 @pytest.mark.parametrize(
-    "command", [command for command in commands() if re.search(r"recipes/(study|unknown|worth).py", command)]
+    "command", [command for command in commands() if re.search(r"recipes/(study|unknown).py", command)]
 )
 def test_a_printed_study_begins(command, clone, monkeypatch):
     """Up to its plan of tasks; the tests of the study run some."""

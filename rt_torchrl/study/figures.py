@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
-from rt_torchrl.study.arms import SystemResult
 from rt_torchrl.study.results import Entry, Results, named
 from rt_torchrl.study.tables import shown
 from rt_torchrl.study.training import CHANGED
@@ -20,8 +19,6 @@ ARMS: dict[str, str] = {"twinning": REAL, **dict(ROLES.items())}
 ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
 POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
 """Colours of twinning with other policies, in the order of the policies."""
-COLOURS = (REAL, "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
-"""Colours of arms on one system."""
 DASHES = ("--", ":", "-.", (0, (1, 1)), (0, (8, 1)))
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
 WIDEST_LINEAR = 5.0
@@ -191,29 +188,6 @@ def cost_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
         ax.set_xscale("log")
     ax.set_xlabel(f"{found['name']} [{found['unit']}]")
     caption(ax, "$J_a$")
-    legend_below(figure, [ax])
-    return figure
-
-
-def regret(found: SystemResult) -> Figure:
-    """Sum of the real costs of each arm less that of as many episodes of the oracle: median and range of the seeds.
-
-    Args:
-        found: arms on one system.
-    """
-    title = f"{found.title}: cost of learning over the oracle; band: range of the seeds"
-    figure, ((ax,),) = panels(1, title=title, size=(9.0, 5.0))
-    for row, arm in enumerate(arm for arm in found.arms if arm.paid):
-        curves = arm.regret(found.least)
-        number = np.arange(1, curves.shape[1] + 1)
-        colour = COLOURS[row % len(COLOURS)]
-        line: Any = DASHES[row // len(COLOURS) % len(DASHES)] if row >= len(COLOURS) else "-"
-        ax.plot(number, np.median(curves, 0), color=colour, linestyle=line, linewidth=1.6, label=arm.name)
-        ax.fill_between(number, curves.min(0), curves.max(0), color=colour, alpha=0.1, linewidth=0.0)
-    ax.set_yscale("symlog", linthresh=max(found.least, 1e-9))
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("real episodes, that of the controller first")
-    caption(ax, "sum of $J_a$ less that of the oracle")
     legend_below(figure, [ax])
     return figure
 
