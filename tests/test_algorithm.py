@@ -140,7 +140,7 @@ def test_the_true_twin_replays_the_record_exactly_under_the_measured_input_only(
 def test_step_five_may_plan_on_a_number_of_its_own():
     found, drawn = twinning(planner=PlannerConfig(iterations=1, realisations=7)), []
     draw = found.virtual.draw
-    found.virtual.draw = lambda count: drawn.append(count) or draw(count)
+    found.virtual.draw = lambda count, **kind: drawn.append(count) or draw(count, **kind)
     found.episode()
     # Planned on, judged on, compared on.
     assert drawn == [7, 3, 3]

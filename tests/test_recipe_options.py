@@ -231,7 +231,7 @@ CONFIGS = {
     ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
     RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},
-    LongTermMemoryConfig: {"capacity": math.inf, "offset": math.inf},
+    LongTermMemoryConfig: {"capacity": math.inf, "correction": math.nan},
     PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "experience": math.inf},
     LearnerConfig: {
         "critic_rate": math.inf,
@@ -239,7 +239,7 @@ CONFIGS = {
         "critic_hidden": (8, 0),
         "reward_scale": math.inf,
     },
-    ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_hidden": (0,), "critic_iterations": 0.5},
+    ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_iterations": 0.5},
     ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
     SafetyConfig: {"interval": "0.5"},
     partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan, "patience": True},
