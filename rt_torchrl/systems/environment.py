@@ -96,8 +96,8 @@ class PlantEnv(EnvBase):
         return generators | {"episodes": self._episodes}
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        self._generator.set_state(state["generator"])
-        self._sensors.set_state(state["sensors"])
+        self._generator.set_state(state["generator"].cpu())
+        self._sensors.set_state(state["sensors"].cpu())
         self._episodes = state["episodes"]
 
     @property
