@@ -161,7 +161,7 @@ class Config(RunConfig):
         }
         if self.noise:
             # An error of 0.5 % in the first reading of the pressure lasts for five days: the closure makes up for it.
-            for preset in ("default", "neural", "mpc"):
+            for preset in ("default", "neural"):
                 twinning = presets[preset]["twinning"]
                 estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
                 presets[preset]["twinning"] = dataclasses.replace(twinning, assimilation=estimated)

@@ -25,6 +25,7 @@ from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
 from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, LongTermMemory, ScaledPolicy
+from rt_torchrl.steps.report import weight_change, weight_vector
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 
@@ -64,7 +65,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
     inputs = plant.acting_inputs
 
     for i in range(options.episodes):
-        before = {role: weights(policy) for role, policy in policies.items()}
+        before = {role: weight_vector(policy) for role, policy in policies.items()}
 
         # Step 1, l. 7 to 13: a real episode; its record is D_S, because n_S = 1.
         acting.begin(policies[live], strength=table.exploration.strength(i))
@@ -101,7 +102,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
         planned = plan.run(J_a, table.planner.iterations)
 
         # Step 6, l. 44 to 47 and the decision tree: both policies on N virtual episodes with random initial states.
-        count, change = table.virtual_episodes, weights(policies[idle]) - before[idle]
+        count, change = table.virtual_episodes, weight_change(policies[idle], before[idle])
         start = plant.draw_initial_state(count, generator)
         z = plant.with_previews(sample_experience([process], count, generator))
         with torch.no_grad():
@@ -114,7 +115,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
                 live, idle = idle, live
         else:
             worse = 0
-            stalled = stalled + 1 if change.norm() / weights(policies[idle]).norm() < referee.stall else 0
+            stalled = stalled + 1 if change < referee.stall else 0
             if stalled > referee.clone_patience:
                 event, stalled = "clone", 0
                 policies[idle].load_state_dict(policies[live].state_dict())
@@ -193,11 +194,6 @@ class DDPG:
         for weight, gradient in zip(trained, gradients, strict=True):
             weight.grad = gradient
         optimiser.step()
-
-
-def weights(module: nn.Module) -> Tensor:
-    """All weights of a module in one vector."""
-    return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
 
 
 def main(config: Config) -> None:

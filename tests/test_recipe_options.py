@@ -138,6 +138,13 @@ def test_presets_of_a_neural_closure_and_of_predictive_control(plant):
     assert dataclasses.replace(mpc, preset="default", twinning=usual.twinning) == usual
 
 
+def test_predictive_control_is_the_default_of_a_task_with_another_method():
+    hop = of_command_line("flapping_wing", "--task", "hop").twinning
+    mpc = of_command_line("flapping_wing", "--task", "hop", "--preset", "mpc").twinning
+    assert mpc == dataclasses.replace(hop, planner=mpc.planner) and mpc.planner.method == "receding_horizon"
+    assert mpc.planner.realisations == hop.planner.realisations == 40
+
+
 def test_a_plant_without_a_paper_has_no_words_of_it():
     pendulum = config_class_of(RECIPES / "pendulum.py")
     assert from_command_line(pendulum, ["--policy", "plant", "--closure", "plant"]) == from_command_line(pendulum, [])

@@ -260,18 +260,11 @@ class RunConfig:
         return None
 
     def presets(self) -> dict[Preset, dict[str, Any]]:
-        """The options that each preset sets.
+        """The options that each preset sets; ``mpc`` is ``default`` with another method of planning.
 
         Override this method where a plant has other ones, or where they depend on other options.
         """
-        usual = type(self)().twinning
-        planner = dataclasses.replace(usual.planner, method="receding_horizon", short_horizon=ShortHorizonConfig())
-        return {
-            "default": {},
-            "paper": {"start": "random", "twinning": PAPER},
-            "neural": {"closure": "mlp"},
-            "mpc": {"twinning": dataclasses.replace(usual, planner=planner)},
-        }
+        return {"default": {}, "paper": {"start": "random", "twinning": PAPER}, "neural": {"closure": "mlp"}}
 
     def suited(self, twinning: TwinningConfig) -> TwinningConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
@@ -293,7 +286,13 @@ class RunConfig:
         """
         usual = type(self)()
         preset: Preset = "neural" if self.closure == "mlp" and self.preset == "default" else self.preset
-        found = dataclasses.replace(usual, preset=self.preset, **self.presets()[preset])
+        found = dataclasses.replace(
+            usual, preset=self.preset, **self.presets()["default" if preset == "mpc" else preset]
+        )
+        if preset == "mpc":
+            planner = found.twinning.planner
+            planner = dataclasses.replace(planner, method="receding_horizon", short_horizon=ShortHorizonConfig())
+            found = dataclasses.replace(found, twinning=dataclasses.replace(found.twinning, planner=planner))
         begun = self if self.start != usual.start else dataclasses.replace(self, start=found.start)
         return dataclasses.replace(found, twinning=begun.suited(found.twinning))
 
