@@ -3,9 +3,9 @@
 import dataclasses
 
 import torch
-from impure import Bounded, Recurrent, Rows
 from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
+from traced_function import Bounded, Recurrent, Rows
 
 from rt_torchrl import Signal
 from rt_torchrl.plants.plant import Transition
@@ -283,7 +283,7 @@ BROKEN = {
     FrozenClosure: "make_closure: has no trainable weights",
     StrongPolicy: r"make_policy: draws 'force' .*outside \[-2, 2\]",
     RememberingPolicy: f"make_policy: {AGAIN}.*a state of the plant",
-    NormalisingPolicy: "make_policy: raised ValueError in .*impure.py, .*Expected more than 1 value.*eval",
+    NormalisingPolicy: "make_policy: raised ValueError in .*traced_function.py, .*Expected more than 1 value.*eval",
     DroppingPolicy: rf"make_policy: {AGAIN}.*\.eval\(\)",
     CutPolicy: "make_policy: autograd finds no dependence on state 'position'",
     RememberingClosure: f"make_neural_closure: {AGAIN}",

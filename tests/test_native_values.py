@@ -98,7 +98,7 @@ def test_special_values_of_expressions(tree):
 
 
 def all_functions(m, s, d):
-    x = m.modules_[0](s).tanh() + 0.3
+    x = m.net(s).tanh() + 0.3
     y = x.exp().log1p() + x.sin() * x.cos() + x.abs().pow(1.3) + torch.atan2(x, s[..., :1]) + x.erf()
     return (y + torch.hypot(x, y) + torch.remainder(x, 0.7) + x.clamp(-0.5, 0.5))[..., :3] * m.w0 + x.sum(
         -1, keepdim=True
@@ -112,7 +112,7 @@ def test_every_kind_of_lanes(lanes, width):
     if not features.get({"e": "avx512dq", "d": "avx2"}.get(lanes.variant, "sse2"), False):
         pytest.skip("this processor lacks these lanes")
     torch.manual_seed(0)
-    for found, exact in compared(Snippet(all_functions, nn.Linear(3, width)), *signals(11, 3), lanes=lanes):
+    for found, exact in compared(Snippet(all_functions, net=nn.Linear(3, width)), *signals(11, 3), lanes=lanes):
         assert gap(found, exact) < 1e-12
 
 

@@ -5,14 +5,12 @@ import warnings
 from collections import OrderedDict
 
 import changes
-import more_snippets
 import pytest
 import snippets
 import torch
-from impure import Recurrent, Rows
 from linear_quadratic import LinearQuadratic
 from torch import nn
-from traced_function import Snippet, compared, gap, signals, traced
+from traced_function import Recurrent, Rows, Snippet, compared, gap, signals, traced
 
 from rt_torchrl.programs.contract import ImpureError
 from rt_torchrl.programs.program import UntraceableError
@@ -26,54 +24,52 @@ from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-CASES, REFUSED = snippets.CASES | more_snippets.CASES, snippets.REFUSED | more_snippets.REFUSED
-REMEDIES = "use|make|write|take|multiply|eliminate|they belong|machine code has|compute"
-UNEQUAL = (*snippets.MIXED, *more_snippets.UNEQUAL, *more_snippets.NO_GRADIENT)
+EQUAL, REFUSED, IMPURE, MIXED = (snippets.TABLE[name] for name in ("equal", "refused", "impure", "mixed"))
+REMEDIES = r"; (use|make|write|take|multiply|eliminate|they belong|machine code has|compute) |raises"
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case not in {*REFUSED, *UNEQUAL, *more_snippets.IMPURE}])
+@pytest.mark.parametrize("case", EQUAL)
 def test_equals_eager(case):
     # Rounding, summed in another order: a Newton iteration amplifies it most.
-    for found, exact in compared(CASES[case], *signals(11, 3)):
+    for found, exact in compared(EQUAL[case][0], *signals(11, 3)):
         assert gap(found, exact) < 1e-10
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_with_the_line_of_the_code_and_the_remedy(case):
-    with pytest.raises(UntraceableError, match=re.escape(REFUSED[case])) as refusal:
-        traced(CASES[case], *signals(11, 3))
-    assert re.search(r"snippets\.py:\d+: .", str(refusal.value)) or case == "deepcopy", refusal.value
-    assert re.search(
-        r"; (use|make|write|take|multiply|eliminate|they belong|machine code has|compute) |raises", str(refusal.value)
-    )
+    snippet, word = REFUSED[case]
+    with pytest.raises(UntraceableError, match=re.escape(word)) as refusal:
+        traced(snippet, *signals(11, 3))
+    assert re.search(r"snippets\.(py|txt):\d+: .", str(refusal.value)) or case == "deepcopy", refusal.value
+    assert re.search(REMEDIES, str(refusal.value))
 
 
-@pytest.mark.parametrize("case", more_snippets.IMPURE)
+@pytest.mark.parametrize("case", IMPURE)
 def test_no_function_of_its_arguments_is_refused_with_the_remedy(case):
-    remedy = "Policy, closure and plant must|Rows are systems of their own"
-    with pytest.raises(ImpureError, match=f"{more_snippets.IMPURE[case]}.*({remedy})"):
-        Native(compiled=False).end_states(CASES[case], *signals(11, 3))
+    (snippet, word), remedy = IMPURE[case], "Policy, closure and plant must|Rows are systems of their own"
+    with pytest.raises(ImpureError, match=f"{word}.*({remedy})"):
+        Native(compiled=False).end_states(snippet, *signals(11, 3))
 
 
-@pytest.mark.parametrize("case", snippets.MIXED)
+@pytest.mark.parametrize("case", MIXED)
 @pytest.mark.parametrize("batch", [1, 11])
 def test_realisations_that_depend_on_each_other_are_refused(case, batch):
     with pytest.raises(UntraceableError, match="differs from what torch computes"):
-        traced(snippets.CASES[case], *signals(batch, 1))
+        traced(MIXED[case][0], *signals(batch, 1))
 
 
 @pytest.mark.slow
 def test_wide_perceptrons_need_no_wide_stack():
     """Each of the arrays of hidden units and of gradients by weights, 4 MiB, lies beyond the stack of a thread."""
     network = nn.Sequential(nn.Linear(3, 256), nn.Tanh(), nn.Linear(256, 256), nn.Tanh(), nn.Linear(256, 3))
-    snippet = Snippet(lambda m, s, d: sum(m.modules_[0](s * k) for k in (1.0, 2.0, 3.0)), network)
+    snippet = Snippet(lambda m, s, d: sum(m.net(s * k) for k in (1.0, 2.0, 3.0)), net=network)
     for found, exact in compared(snippet, *signals(3, 2)):
         assert gap(found, exact) < 1e-12
 
 
 def test_refusals_hold_no_tensors():
     """The traceback of a refusal would keep everything that was traced."""
-    case, (state, drive) = snippets.CASES["sort"], signals(2, 2)
+    (case, _), (state, drive) = REFUSED["sort"], signals(2, 2)
     with pytest.warns(UserWarning, match="sort"):
         assert code.code_of(case, state, drive) is None
     assert code.code_of(case, state, drive) is None  # without another warning
@@ -88,7 +84,7 @@ def test_refusals_hold_no_tensors():
 def test_what_is_no_number_refuses_no_code(where, wanted):
     """A twin that explodes once does not leave its engine for the rest of a training."""
     network, (state, drive) = nn.Linear(3, 3).double(), signals(4, 2)
-    interval = Snippet(lambda m, s, d: m.w0 * torch.tanh(m.modules_[0](s) * d.t.unsqueeze(-1) * d.exogenous), network)
+    interval = Snippet(lambda m, s, d: m.w0 * torch.tanh(m.net(s) * d.t.unsqueeze(-1) * d.exogenous), net=network)
     spoiled = state.detach() if where == "state" else network.bias.data
     before = spoiled.clone()
     spoiled.fill_(torch.nan)
@@ -165,7 +161,7 @@ def test_a_gradient_that_is_no_number_is_not_traced_again_and_again(share, monke
 
 
 def test_the_engine_parallel_refuses_attention_in_words():
-    snippet, (state, drive) = snippets.CASES["scaled dot product"], signals(4, 3)
+    (snippet, _), (state, drive) = EQUAL["scaled dot product"], signals(4, 3)
     found = Native(compiled=False).end_states(snippet, state, drive)
     torch.testing.assert_close(found, Autograd(compiled=False).end_states(snippet, state, drive))
     with pytest.raises(ValueError, match=r"engine='parallel' needs .* Use engine='native' or 'autograd'"):
@@ -186,7 +182,7 @@ def cost(plant, engine, rollouts):
 
 @pytest.mark.parametrize("kind", changes.KINDS)
 def test_a_change_is_followed_or_the_thing_is_refused_by_name(kind, monkeypatch):
-    make, change = changes.KINDS[kind]
+    make, change, refusal = changes.KINDS[kind]
     plant, lasting = make(), {}
     with changes.as_before(monkeypatch), warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -197,9 +193,9 @@ def test_a_change_is_followed_or_the_thing_is_refused_by_name(kind, monkeypatch)
                 assert cost(plant, "native", rollouts) == pytest.approx(exact, rel=1e-9)
     refusals = [str(each.message) for each in said if "takes the place of 'native'" in str(each.message)]
     assert exact > 1.0  # the factor is in the cost
-    if kind in changes.REFUSED:
+    if refusal:
         remedies = ("make it an attribute or a buffer", "import it at the top")
-        assert any(changes.REFUSED[kind] in text and any(map(text.count, remedies)) for text in refusals), refusals
+        assert any(refusal in text and any(map(text.count, remedies)) for text in refusals), refusals
     else:
         assert not refusals
 
@@ -331,15 +327,10 @@ class Shaken(LinearQuadratic):
 
 
 @pytest.mark.parametrize("engine", ["native", "autograd"])
-def test_a_plant_that_is_no_function_is_refused(engine):
-    plant = Shaken(horizon=1.0)
-    with pytest.raises(ImpureError, match=f"a method of plant 'linear_quadratic' {AGAIN}"):
-        Rollout(plant, plant.closure, engine=engine)(*scenario(), torch.zeros(3, 10, 1).double())
-
-
-@pytest.mark.parametrize("engine", ["native", "autograd"])
-def test_a_cost_that_is_no_function_is_refused(engine):
-    plant = Noisy(horizon=1.0)
-    policy = plant.make_policy(torch.Generator())
-    with pytest.raises(ImpureError, match=f"a method of plant 'linear_quadratic' {AGAIN}"):
-        Rollout(plant, plant.closure, policy, engine=engine).costs(*scenario())
+def test_a_plant_or_cost_that_is_no_function_is_refused(engine):
+    message = f"a method of plant 'linear_quadratic' {AGAIN}"
+    shaken, noisy = Shaken(horizon=1.0), Noisy(horizon=1.0)
+    with pytest.raises(ImpureError, match=message):
+        Rollout(shaken, shaken.closure, engine=engine)(*scenario(), torch.zeros(3, 10, 1).double())
+    with pytest.raises(ImpureError, match=message):
+        Rollout(noisy, noisy.closure, noisy.make_policy(torch.Generator()), engine=engine).costs(*scenario())
