@@ -270,12 +270,6 @@ def test_costs_of_both_policies_are_from_the_same_draws():
     assert first["model_free"] == first["model_based"] and first["model_free"] != second["model_free"]
 
 
-@pytest.mark.parametrize("argument", ["realisations", "records", "virtual_episodes"])
-def test_wrong_counts_are_refused(argument):
-    with pytest.raises(ValueError, match=f"{argument}=0 must be at least 1"):
-        TwinningConfig(**{argument: 0})
-
-
 def test_a_step_of_ones_own_flows_with_the_others():
     """The twin is the real system, so that the residual of the page is rounding."""
     plant = LinearQuadratic(horizon=2.0)

@@ -103,13 +103,6 @@ def test_the_prior_holds_the_perceptron_and_leaves_the_first_states():
     assert change[1] < 1e-4 < 1e-2 < change[0]
 
 
-@pytest.mark.parametrize("options", [{"method": "gradient"}, {"inputs": "realisations"}])
-def test_what_first_states_need_is_demanded(options):
-    (value,) = options.values()
-    with pytest.raises(ValueError, match=f"initial='estimated' .* needs .* {value!r}"):
-        assimilation(Line(), Slope(), **options)
-
-
 class Capped(Slope):
     """ẋ = min(w_0, 1): above one the weight has no effect."""
 
@@ -391,8 +384,3 @@ def test_a_biased_sensor_is_found_in_step_4():
     torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match=r"biased=\('roof',\): roof is none of the sensors"):
         SensorAssimilation(DigitalTwin(plant, closure), config("position", biased=("roof",)))
-
-
-def test_what_only_a_fit_to_sensors_takes_is_refused_without_sensors():
-    with pytest.raises(ValueError, match="give sensors, too"):
-        config(biased=("pressure",))

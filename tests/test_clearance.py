@@ -116,22 +116,6 @@ def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
     assert [{**record, "seconds": 0} for record in resumed] == [{**record, "seconds": 0} for record in whole]
 
 
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ({"states": {"speed": (0.0, 1.0)}}, "limits.states has speed; the plant has position, velocity"),
-        ({"actions": {"force": (3.0, 4.0)}}, "leave nothing of the action's range"),
-        ({"actions": {"force": (1.0, -1.0)}}, "least value first"),
-        ({"rates": {"force": 0.0}}, "must be positive"),
-        ({"rates": {"force": float("nan")}}, "must be positive"),
-        ({"tolerated": 2.0}, r"limits.tolerated=2.0 must lie in \[0, 1\]"),
-    ],
-)
-def test_limits_that_cannot_be_are_refused(limits, message):
-    with pytest.raises(ValueError, match=message):
-        OperatingLimits(LinearQuadratic(), OperatingLimitsConfig(**limits))
-
-
 def test_limits_need_a_safety_layer():
     with pytest.raises(ValueError, match="no safety layer that holds them"):
         twinning(limits=LIMITS)

@@ -138,13 +138,6 @@ def test_what_is_refused_raises_no_multiplier():
     assert raised[0] == raised[1] == raised[2] and raised[0][0] > 0.0
 
 
-def test_a_planner_without_whole_episodes_is_refused():
-    with pytest.raises(ValueError, match=r"constraints\.states of position need plans over whole episodes"):
-        PlannerConfig(method="receding_horizon", constraints=ConstraintsConfig(states=POSITION))
-    with pytest.raises(ValueError, match=r"constraints\.states position=3\.0 to -1\.0 must have its least value first"):
-        ConstraintsConfig(states={"position": (3.0, -1.0)})
-
-
 def test_results_say_how_often_and_how_far(tmp_path, capsys):
     planner = PlannerConfig(iterations=3, constraints=ConstraintsConfig(states={"velocity": (-0.05, 0.05)}))
     config = RunConfig(

@@ -220,22 +220,3 @@ def test_a_record_of_14_400_points_needs_no_dense_matrix():
     assert drawn.shape == (2, 14_400, 1) and drawn.isfinite().all()
     # Time averages of one path; correlation time of 19 steps: 760 independent values, 5 % of a variance, five of them.
     assert (drawn - found.mean).var().item() == pytest.approx(found.covariance[0, 0, 0].item(), rel=0.25)
-
-
-@pytest.mark.parametrize(
-    "values, message",
-    [
-        (np.where(np.arange(20) == 6, np.nan, 1.0), r"not finite at sample 6, t = 3 s"),
-        (np.where(np.arange(20) == 19, np.inf, 1.0), r"not finite at sample 19, t = 9\.5 s"),
-        (np.ones(7), "record has 7 samples; at least 8"),
-    ],
-)
-def test_bad_records_are_refused(values, message):
-    with pytest.raises(ValueError, match=message):
-        process(values)
-
-
-@pytest.mark.parametrize("change", [{"knots": 7}, {"kernel_width": 0.0}, {"penalty": -1.0}, {"tube": math.nan}])
-def test_wrong_parameters_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        ExogenousConfig(**change)

@@ -58,13 +58,6 @@ def test_an_episode_does_not_begin_with_the_noise_of_the_last_one():
     assert (firsts[0] - firsts[1]).abs().min() > 1e-2
 
 
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize("argument", ["spread", "episodes", "correlation_time"])
-def test_parameters_out_of_range_are_refused(argument, value, unchecked):
-    with pytest.raises(ValueError, match=f"{argument}={value}"):
-        ExplorationConfig(**{argument: value})
-
-
 def test_the_strength_falls_to_zero():
     assert [ExplorationConfig(episodes=4).strength(episode) for episode in range(6)] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
     assert ExplorationConfig(episodes=0).strength(9) == 0.0

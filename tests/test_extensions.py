@@ -353,31 +353,6 @@ def test_a_plant_says_which_methods_it_must_define():
         Half(dt=0.1, horizon=1.0, closure=nn.Identity())
 
 
-class Stepping(LinearQuadratic):
-    def step(self, t, state, command, exogenous, closure):
-        return super().step(t, state, command, exogenous, closure)
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: LaggedActuator(LinearQuadratic(), "torque", 1.0), r"action='torque'.*force"),
-        (lambda: LaggedActuator(LinearQuadratic(), "force", 0.0), r"\[0.0\].* must be force_lag \[s\], positive"),
-        (lambda: LaggedActuator(Stepping(), "force", 1.0), r"overrides step\(\)"),
-        (lambda: LaggedActuator(EXTENDED["lag"](), "force", 1.0), r"already has the states lagged_force"),
-        (lambda: ResonantActuator(LinearQuadratic(), "force", 1.0, 1.0), r"damping=1.0.*\(0, 1\)"),
-        (lambda: DelayedActuator(LinearQuadratic(), "force", 0.25), r"1 to 64 control intervals of 0.1 s"),
-        (lambda: LaggedActuator(LinearQuadratic(), "force", 0.3, stages=0), r"stages=0"),
-        (lambda: LaggedCoefficients(EXTENDED["lag"](), 1.0, (0.0,)), r"closure of the plant itself"),
-        (lambda: BiasedSensor(LinearQuadratic(), "height", 1.0, scale=1.0), r"state='height'.*position, velocity"),
-        (lambda: BiasedSensor(LinearQuadratic(), "position", 1.0, scale=0.0), r"scale=0.0 must be positive"),
-    ],
-)
-def test_what_cannot_be_extended_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_hidden_states_need_a_start():
     class Startless(Extension):
         pass

@@ -45,19 +45,6 @@ def test_a_local_minimum_is_left_by_other_first_weights():
     assert found[4][0].start == found[1][0].start
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"starts": 0},
-        {"starts": 2},
-        {"starts": 2, "method": "levenberg_marquardt", "inputs": "record", "initial": "estimated"},
-    ],
-)
-def test_what_several_starts_need_is_demanded(options):
-    with pytest.raises(ValueError, match=f"starts={options['starts']}.*gradient|starts=2.*estimated"):
-        AssimilationConfig(**options)
-
-
 @pytest.mark.slow
 def test_drag_at_zero_angle_is_not_lost_on_the_way():
     """b is 3 % of the drag, so that a step may give it up while a and c are still far from theirs."""

@@ -258,32 +258,3 @@ def test_episodes_start_at_rest_in_the_origin(plant):
     wind = plant.draw_exogenous(3, seeded())
     assert wind.shape == (3, 10_000, 1)
     assert torch.equal(wind, plant.draw_exogenous(3, seeded()))
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ({"dt": 5e-3}, "wing beat"),
-        ({"horizon": -1.0}, "horizon"),
-        ({"stroke_plane_rate": 0.0}, "stroke_plane_rate"),
-        ({"observe": ("gyroscope",)}, "gyroscope"),
-        ({"target": (5.0, math.nan)}, "target"),
-        ({"mass": 0.0}, "mass"),
-        ({"mass": math.inf}, "mass"),
-        ({"closure": QuasiSteadyPolar(double(1.71, 43.0, 1595.0))}, "unstable"),
-    ],
-)
-def test_bad_arguments_raise(arguments, message):
-    with pytest.raises((ValueError, TypeError), match=message):  # the type checker of the tests refuses "sharp" first
-        FlappingWing(**arguments)
-
-
-@pytest.mark.parametrize("coefficients", [(1.0, 2.0), (1.0, -1.0, 1.0), (1.0, 0.0, 1.0), (1.0, math.nan, 1.0)])
-def test_bad_coefficients_raise(coefficients):
-    with pytest.raises(ValueError, match="coefficients"):
-        QuasiSteadyPolar(double(*coefficients))
-
-
-def test_bad_spread_raises():
-    with pytest.raises(ValueError, match="spread"):
-        QuasiSteadyPolar.draw(seeded(), spread=1.0)

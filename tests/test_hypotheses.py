@@ -411,24 +411,6 @@ def test_hypotheses_are_chosen_by_name():
     assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is DigitalTwin
 
 
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect 'inflow'; choose among 'late', 'lags'"),
-        (lambda: HypothesesConfig(which="none", names=("late",)), r"which='automatic'"),
-        (lambda: HypothesesConfig(call=float("nan")), r"call=nan"),
-        (lambda: TwinEnsemble(PLANT, PLANT.closure, PLANT.suspects(), {}), r"equal names"),
-        (
-            lambda: TwinEnsemble(PLANT, PLANT.closure, {"x": LinearQuadratic(dt=0.2)}, {"x": PLANT.closure}),
-            r"hypothesis 'x' must extend the twin's plant",
-        ),
-    ],
-)
-def test_what_is_no_hypothesis_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 @pytest.mark.parametrize("which", ["none", "automatic"])
 def test_options_are_those_of_the_algorithm(which, tmp_path):
     """They reach the twin and its step 4 through a run."""

@@ -599,11 +599,3 @@ def test_state_round_trip_samples_the_same():
 def test_an_episode_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="11 transitions at once do not fit a long-term memory of 10"):
         memory().store(labelled(list(range(11))), torch.ones(11))
-
-
-@pytest.mark.parametrize(
-    "change", [{"capacity": 0}, {"prioritisation": 1.5}, {"prioritisation": -0.1}, {"correction": 2.0}]
-)
-def test_wrong_parameters_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        LongTermMemoryConfig(**change)

@@ -72,11 +72,6 @@ def test_a_gradient_that_is_not_a_number_is_not_hidden():
     assert gradient(weights, limited_mean(costs, weights, 10.0)).isnan().any()
 
 
-def test_a_limit_below_one_is_refused():
-    with pytest.raises(ValueError, match=r"episode_gradient_limit=0\.5 of the planning must be at least 1"):
-        PlannerConfig(episode_gradient_limit=0.5)
-
-
 @pytest.mark.parametrize("engine", ["native", "autograd"])
 def test_gradients_of_flights_are_limited_alike(engine):
     plant, generator, policy = LinearQuadratic(), torch.Generator().manual_seed(0), LinearGain([[0.4, 0.2]])

@@ -54,20 +54,6 @@ def test_columns_are_declared_with_a_unit_or_factor_and_offset(text, expected):
     assert dataclasses.astuple(Column.parse(text)) == expected
 
 
-@pytest.mark.parametrize(
-    "text", ["omega", "=force", "x=force*", "x=force*two", "x=force+1+2", "x=force*2*3", "x=force[]", "x=force[N]*2"]
-)
-def test_columns_that_are_not_understood_are_refused(text):
-    with pytest.raises(ValueError, match="not understood"):
-        Column.parse(text)
-
-
-@pytest.mark.parametrize("text", ["x=force*0", "x=force*nan", "x=force+inf"])
-def test_units_that_lose_the_signal_are_refused(text):
-    with pytest.raises(ValueError, match="finite"):
-        Column.parse(text)
-
-
 def test_columns_are_converted_by_their_units(tmp_path):
     (tmp_path / "log.csv").write_text(TABLE)
     columns = [Column.parse(text) for text in ("t=time[ms]", "x_mm=position[mm]", "velocity=velocity[km/h]")]
@@ -193,13 +179,6 @@ def test_dates_are_no_values_of_a_signal(tmp_path):
     table.to_parquet(tmp_path / "log.parquet")
     with pytest.raises(ValueError, match="column 'force' .* holds dates; force needs numbers"):
         read_log(tmp_path / "log.parquet", PLANT)
-
-
-def test_files_that_cannot_be_read_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_log(tmp_path / "none.csv", PLANT)
-    with pytest.raises(ValueError, match="must be one of .csv, .parquet"):
-        read_log(tmp_path / "log.xlsx", PLANT)
 
 
 def test_bad_rows_become_gaps_on_demand():
@@ -336,19 +315,3 @@ def test_jitter_and_noise_are_as_large_as_asked():
 def test_units_are_converted(unit, signal, number, expected):
     # Factors of some digits are multiplied: rounding only.
     assert converted(np.array([number]), unit, signal) == pytest.approx([expected], rel=1e-13)
-
-
-@pytest.mark.parametrize(
-    ("unit", "signal", "message"),
-    [
-        ("Hz", "rad/s", r"'Hz' \(base units 1 / second\) and 'rad/s' \(radian / second\) do not measure the same"),
-        ("rad", "-", "do not measure the same"),
-        ("N", "N m", "do not measure the same"),
-        ("furlongs_of_old", "m", "unit 'furlongs_of_old' is not known"),
-        ("k*(", "m", r"unit 'k\*\(' is not understood"),
-        ("5 m", "m", "unit '5 m' is not understood"),
-    ],
-)
-def test_units_that_measure_something_else_are_refused(unit, signal, message):
-    with pytest.raises(ValueError, match=message):
-        converted(np.ones(2), unit, signal)

@@ -22,7 +22,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import code, native
-from rt_torchrl.trajectories.engines.code import Inputs
 from rt_torchrl.trajectories.engines.interval import Autograd, CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import Rollout
@@ -109,17 +108,6 @@ def test_gradients_of_plants(plant, closure, driver, batch, n, seed):
         closure = "law"
     task = Task(plant, closure, driver, batch, n, seed)
     assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", ["commands", "policy", "perceptron"])
-@pytest.mark.parametrize("closure", ["law", "true", "perceptron"])
-@pytest.mark.parametrize("plant", PLANTS)
-def test_gradients_of_every_plant(plant, closure, driver):
-    if closure != "perceptron" or plant in OUTPUTS:
-        for seed in range(3):
-            task = Task(plant, closure, driver, 5, 7, seed)
-            assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
 
 
 @pytest.mark.parametrize("batch", range(1, 18))
@@ -252,16 +240,6 @@ def test_the_own_closure_of_a_plant_keeps_its_weights(driver):
     assert isinstance(task.plant.closure.matrix, nn.Parameter) and task.plant.closure.matrix.requires_grad
 
 
-def test_a_sweep_belongs_to_the_interval_that_wants_it():
-    """The recurrence was made for an interval of the same kind, which has changed since."""
-    task, other = Task(), Task()
-    with torch.no_grad():
-        NATIVE.end_states(other.interval, other.state, other.drive)
-        other.plant._A.mul_(2.0)
-    assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
-    assert_equal(other.gradients(NATIVE), other.gradients(AUTOGRAD))
-
-
 def test_an_interval_may_change_before_the_backward_pass():
     task = Task()
     exact = task.gradients(AUTOGRAD)
@@ -325,10 +303,6 @@ def test_states_that_leave_the_numbers_are_kept():
         task.state[4, 0], task.state[7, 1] = math.inf, math.nan
         found, exact = (e.end_states(task.interval, task.state, task.drive) for e in (NATIVE, AUTOGRAD))
     torch.testing.assert_close(found, exact, rtol=1e-13, atol=0.0, equal_nan=True)
-
-
-def test_weights_are_one_row():
-    assert Inputs(nn.Linear(2, 1).double()).row().shape == (3,)
 
 
 class Saturated(nn.Module):

@@ -4,7 +4,6 @@ import math
 import threading
 
 import llvmlite.binding as llvm
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -15,7 +14,7 @@ from traced_function import Snippet, compared, gap, marched, signals
 from rt_torchrl.programs.machine_code import Lanes, lanes_of_this_machine, march_text
 from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.trajectories.engines import native
-from rt_torchrl.trajectories.engines.code import Group, Inputs, IntervalCode, Point, for_each_group
+from rt_torchrl.trajectories.engines.code import Inputs, IntervalCode, Point, for_each_group
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.rollout import all_finite
 
@@ -137,20 +136,6 @@ def test_the_text_compiles_for_other_processors():
 # Groups of lanes: their work is shared among threads, once each, and a failure of any of them is raised
 
 
-@pytest.fixture(params=[1, 2, 4])
-def threads(request):
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
-
-
-def test_every_group_is_worked_once(threads):
-    found = []
-    for_each_group(21, 8, found.append)
-    assert sorted(found) == [Group(0, 8, 8), Group(8, 16, 8), Group(16, 21, 8)]
-
-
 def test_groups_run_at_the_same_time():
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -161,8 +146,8 @@ def test_groups_run_at_the_same_time():
         torch.set_num_threads(torch_threads)
 
 
-@pytest.mark.parametrize("failing", [0, 8, 16])
-def test_a_failure_is_raised_when_nobody_works_any_more(threads, failing):
+@pytest.mark.parametrize("failing", [0, 16])
+def test_a_failure_is_raised_when_nobody_works_any_more(failing):
     working = []
 
     def work(group):
@@ -176,17 +161,6 @@ def test_a_failure_is_raised_when_nobody_works_any_more(threads, failing):
     with pytest.raises(ArithmeticError, match=f"group {failing}"):
         for_each_group(21, 8, work)
     assert not working
-
-
-def test_lanes_are_gathered_and_scattered():
-    rows = np.arange(2 * 5 * 3, dtype=float).reshape(2, 5, 3)
-    group, found = Group(2, 5, 4), np.zeros((2, 5, 3))
-    lanes = group.gather(rows[..., :1], rows[..., 1:])
-    np.testing.assert_array_equal(lanes[1, :, 2], rows[1, 4])
-    np.testing.assert_array_equal(lanes[..., 3], lanes[..., 2])  # what is left repeats the last realisation
-    group.scatter(lanes, found)
-    np.testing.assert_array_equal(found[:, 2:], rows[:, 2:])
-    assert not found[:, :2].any()
 
 
 @pytest.mark.parametrize("odd", [float("nan"), float("inf"), -float("inf")])

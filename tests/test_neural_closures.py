@@ -67,17 +67,6 @@ def test_the_correction_is_bounded_wherever_the_features_are():
     assert (correction(far).abs() <= torch.tensor([0.5, 2.0])).all() and (correction(far).abs() > 0.4).any()
 
 
-@pytest.mark.parametrize(("ranges", "bounds"), [([(1.0, 1.0)], [1.0]), ([(0.0, 1.0)], [0.0])])
-def test_wrong_scales_are_refused(ranges, bounds):
-    with pytest.raises(ValueError, match="ranges=.*low to high.*bounds="):
-        BoundedPerceptron(ranges, bounds, hidden=(4,), generator=seeded())
-
-
-def test_a_plant_without_a_neural_closure_says_so():
-    with pytest.raises(ValueError, match="'linear_quadratic' has no neural closure"):
-        LinearQuadratic().make_neural_closure(seeded(), (8,))
-
-
 def test_both_sides_of_a_wing_are_alike_and_its_drag_is_positive():
     closure, angle = disturbed(PLANTS[1], 5.0), torch.linspace(0.1, 3.0, 50, dtype=torch.float64)
     one, other = (closure(torch.stack([a.sin(), a.cos()], -1)) for a in (angle, -angle))
@@ -195,12 +184,6 @@ def test_a_prior_leaves_the_law_free():
     Assimilation(twin, config).update([flown.each()[0]], [], 1, seeded())
     # With the perceptron held, the law finds the true matrix as it does alone.
     torch.testing.assert_close(twin.closure.law.matrix, plant.closure.matrix, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(("option", "message"), [({"prior": -1.0}, "prior=-1.0"), ({"segment": -1}, "segment=-1")])
-def test_wrong_options_are_refused(option, message):
-    with pytest.raises(ValueError, match=message):
-        AssimilationConfig(**option)
 
 
 def test_a_segment_longer_than_the_record_is_refused():

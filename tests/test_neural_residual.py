@@ -322,44 +322,6 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
     assert moved - set(plant.controller_states) >= STATES[plant.name]
 
 
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda base: NeuralResidual(base, {}, inputs=("force",)), r"greatest=\{\} must name.*'position', 'velocity'"),
-        (
-            lambda base: NeuralResidual(base, {"height": 1.0}, inputs=("force",)),
-            r"greatest=.*'height'.* must name states",
-        ),
-        (lambda base: NeuralResidual(base, {"velocity": 0.0}, inputs=("force",)), r"greatest=0.0 of 'velocity'"),
-        (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("speed",)), r"inputs=\('speed',\).*'force'"),
-        (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=()), r"inputs=\(\)"),
-        (
-            lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("position",)),
-            r"'position' of the residual goes from -inf to inf m; give ranges=\{'position': \(low, high\)\}",
-        ),
-        (
-            lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("force",), ranges={"mass": (0.0, 1.0)}),
-            r"ranges: 'mass' are not among inputs=\('force',\)",
-        ),
-        (
-            lambda base: NeuralResidual(LaggedActuator(base, "force", 1.0), {"lagged_force": 1.0}, inputs=("force",)),
-            r"greatest=.*'lagged_force'.* a sensor reads",
-        ),
-        (
-            lambda base: NeuralResidual(WindTurbine(), {"blade_pitch": 1.0}, inputs=("blade_pitch",)),
-            r"greatest=.*'blade_pitch'.*'wind_turbine' .*no controller computes; choose some of 'rotor_speed'",
-        ),
-        (
-            lambda base: make_twin(base, base.closure, HypothesesConfig(names=("no, never",))),
-            r"does not suspect 'no, ne",
-        ),
-    ],
-)
-def test_what_makes_no_residual_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make(Suspecting())
-
-
 def test_names_with_commas_are_quoted():
     with pytest.raises(ValueError, match=r"choose among 'lags', 'late, twice', 'position sensor', 'unknown force'"):
         make_twin(Suspecting(), LinearClosure([[0.0, 0.0], [0.0, 0.0]]), HypothesesConfig(names=("inflow",)))

@@ -30,9 +30,6 @@ from rt_torchrl import (
     shipped_plants,
 )
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.unknown import TwoZones
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
@@ -385,16 +382,6 @@ def test_the_page_runs(tmp_path, monkeypatch):
     found = {}
     exec("\n".join(blocks("policies_and_closures.md", "python")), found)
     assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
-
-
-def test_refusals():
-    with pytest.raises(ValueError, match="count=0 of past observations must be at least 1"):
-        StackedObservations(LinearQuadratic(), 0)
-    with pytest.raises(ValueError, match="already has the states position_error_1_ago, velocity_error_1_ago"):
-        StackedObservations(StackedObservations(LinearQuadratic(), 1), 1)
-    for kind, base in ((LaggedInflow, WindTurbine()), (TwoZones, CryogenicTank())):
-        with pytest.raises(ValueError, match=f"base=StackedObservations of {kind.__name__} must be the .* itself"):
-            kind(StackedObservations(base, 1), *((2.0,) if kind is LaggedInflow else (2.0, 3600.0)))
 
 
 def test_names_and_units_of_the_signals():

@@ -146,26 +146,6 @@ def test_mass_and_length_follow_from_a_log_that_passes_the_seam():
     assert found.autocorrelation.abs().max() < 0.6
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"gravity": 0.0}, "gravity=0.0"), ({"guess": -1.0}, "guess=-1.0")],
-)
-def test_bad_options_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        Pendulum(**options)
-
-
-def test_another_time_step_than_gymnasiums_is_refused():
-    with pytest.raises(ValueError, match=r"dt=0.025 s of the plant must be that of Gymnasium's pendulum, 0.05 s"):
-        gymnasium_pendulum(Pendulum(dt=0.025))
-
-
-def test_the_engine_that_knows_no_own_step_is_refused():
-    plant = Pendulum()
-    with pytest.raises(ValueError, match="odeint_adjoint.*own; use native, parallel or autograd"):
-        Rollout(plant, plant.closure, plant.make_policy(seeded()), engine="odeint_adjoint")
-
-
 def test_engines_agree_without_inputs():
     """The exact gradients of three engines on a plant that has no exogenous input."""
     plant, gradients = Pendulum(horizon=1.0), []

@@ -282,15 +282,6 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies
 
 
-@pytest.mark.parametrize(
-    "options", [{"extremes": -1}, {"starts": -1}, {"experience": 0}, {"iterations": -1}, {"realisations": 0}]
-)
-def test_a_number_of_plans_that_makes_no_sense_is_refused(options):
-    (name,) = options
-    with pytest.raises(ValueError, match=f"{name}={options[name]}"):
-        PlannerConfig(**options)
-
-
 def test_the_copy_that_plans_over_a_short_horizon_goes_on():
     planner = PlannerConfig(iterations=1, realisations=2, short_horizon=ShortHorizonConfig(window=5))
     found = twinning(arm="model_based", planner=planner)

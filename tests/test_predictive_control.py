@@ -247,14 +247,6 @@ def test_a_preview_knows_the_record_and_holds_its_end():
     assert every(9.0, record[:, 18], 4).flatten().tolist() == [18.0, 19.0, 19.0, 19.0]
 
 
-def test_impossible_forecasts_are_refused():
-    record = torch.zeros(1, 20, 1).double()
-    with pytest.raises(ValueError, match="must be positive"):
-        Decaying(torch.zeros(1).double(), torch.zeros(1).double(), dt=0.5)
-    with pytest.raises(ValueError, match="horizon=10"):
-        Decaying.fitted(record, dt=0.5, horizon=10.0)
-
-
 N = 10
 
 
@@ -371,13 +363,3 @@ def test_it_acts_as_a_policy_whose_scatter_is_learned_and_kept():
     assert torch.equal(found.low, records.amin((0, 1))) and torch.equal(found.high, records.amax((0, 1)))
     again.load_state_dict(policy.state_dict())
     assert torch.equal(again.fly(state, exogenous).actions, policy.fly(state, exogenous).actions)
-
-
-@pytest.mark.parametrize("pairs", [0, 11])
-def test_impossible_numbers_of_futures_are_refused(pairs):
-    records = PLANT.draw_exogenous(3, torch.Generator().manual_seed(0))
-    with pytest.raises(ValueError, match=f"pairs={pairs}"):
-        Scattered.fitted(Held(), records, dt=PLANT.dt, horizon=1.0, pairs=pairs)
-    if not pairs:
-        with pytest.raises(ValueError, match="pairs=0"):
-            PredictiveConfig(pairs=pairs)

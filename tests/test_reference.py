@@ -100,11 +100,6 @@ def test_a_window_is_no_longer_than_an_episode(horizon, expected):
     assert fitting(window, LinearQuadratic(horizon=horizon)).horizon == pytest.approx(expected)
 
 
-def test_an_episode_shorter_than_the_time_between_two_plans_is_refused():
-    with pytest.raises(ValueError, match="horizon=2 s of plant 'linear_quadratic' is shorter than the 3 s between"):
-        fitting(dataclasses.replace(WINDOW, horizon=6.0, period=3.0), LinearQuadratic(horizon=2.0))
-
-
 def test_the_tanks_limit_begins_from_valves_that_suit_its_command():
     config = recipe("cryogenic_tank").Config
     duty, drop = (config(command=command, horizon=6000.0).limit() for command in ("duty", "drop"))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rt_torchrl import LaggedActuator, StackedObservations
+from rt_torchrl import StackedObservations
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine, steps_of
@@ -89,11 +89,6 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     assert torch.equal(other.states[:, 0, 0], found.states[:, 0, 0])
 
 
-def test_an_interval_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="dt=0.25 s must be a multiple of the 0.1 s"):
-        steps_of(WindTurbine(dt=0.25))
-
-
 def test_the_controllers_side_remembers_as_a_step_of_the_plant_does():
     """Answers to a simulator whose rotor stands still in what it reports; the wind is the plant's draw."""
     plant = StackedObservations(WindTurbine(horizon=5.0), 2)
@@ -115,8 +110,3 @@ def test_the_controllers_side_remembers_as_a_step_of_the_plant_does():
         expected = torch.cat([seen[max(k - j, 0)][:n] for j in range(3)])
         torch.testing.assert_close(seen[k], expected, rtol=0.0, atol=0.0)
     assert not torch.equal(seen[3][:n], seen[2][:n])
-
-
-def test_a_plant_with_hidden_states_is_refused():
-    with pytest.raises(ValueError, match="must be a WindTurbine without hidden states"):
-        rosco_turbine(LaggedActuator(WindTurbine(), "blade_pitch", 1.0))

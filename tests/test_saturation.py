@@ -136,25 +136,6 @@ def test_check_names_the_worst_pressure_and_accepts_the_ends():
     assert all(x.isfinite().all() for x in fit(double(LOW, HIGH)))
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ({"fluid": "Unobtainium"}, "not known to CoolProp; choose a pure fluid such as Hydrogen"),
-        ({"fluid": "Air"}, "mixture"),
-        ({"low": 5e3}, "triple point, 7.358 kPa"),
-        ({"high": 1290e3}, "critical pressure, 1232 kPa"),
-        ({"fluid": "Helium"}, "critical pressure, 216.9 kPa"),
-        ({"low": 500e3, "high": 400e3}, "increasing"),
-        ({"low": -1.0}, "positive"),
-        ({"high": math.inf}, "finite"),
-        ({"low": math.nan}, "positive"),
-    ],
-)
-def test_bad_arguments_raise(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Saturation(**arguments)
-
-
 def test_a_fit_that_misses_its_tolerance_raises(monkeypatch):
     monkeypatch.setattr(saturation, "TOLERANCE", 1e-12)
     with pytest.raises(ValueError, match="narrow the range"):

@@ -125,12 +125,3 @@ def test_its_state_is_all_it_goes_on_from():
 def test_a_window_longer_than_an_episode_is_refused():
     with pytest.raises(ValueError, match="window=10 exceeds the 5 control intervals"):
         planner(LinearQuadratic(horizon=0.5))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"window": -1}, {"discount": 1.0}, {"critic_iterations": 0}, {"policy_rate": 0.0}],
-)
-def test_bad_parameters_are_refused(options):
-    with pytest.raises(ValueError, match=f"{next(iter(options))}="):
-        ShortHorizonConfig(**options)

@@ -10,7 +10,6 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from scipy.optimize import brentq
 from seeds_and_numbers import double
-from torch import nn
 from torchdiffeq import odeint
 
 from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, rk4_step
@@ -151,42 +150,6 @@ def test_twin_replays_and_controls_with_its_own_closure():
         assert not torch.equal(other, twin.replay(state, exogenous, command).states)
 
 
-def call(plant=None, policy=None, *, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1), spoil=None, **options):
-    plant = plant or LinearQuadratic()
-    values = {"initial_state": torch.zeros(state).double(), "exogenous": torch.zeros(exogenous).double()}
-    values |= {} if command is None else {"command": torch.zeros(command).double()}
-    if spoil:
-        values[spoil].flatten()[3] = math.nan
-    return Rollout(plant, plant.closure, policy, **options)(**values)
-
-
-@pytest.mark.parametrize(
-    "request_, message",
-    [
-        (lambda: call(state=(2, 3)), r"initial_state has shape \(2, 3\).*needs shape \(2, 2\)"),
-        (lambda: call(exogenous=(3, 50, 1)), r"exogenous has shape \(3, 50, 1\).*needs shape \(2, 50, 1\)"),
-        (lambda: call(exogenous=(2, 50, 2)), r"exogenous has shape \(2, 50, 2\)"),
-        (lambda: call(command=(2, 49, 1)), r"command has shape \(2, 49, 1\).*needs shape \(2, 50, 1\)"),
-        (lambda: call(command=None), "without a policy: pass command"),
-        (lambda: call(policy=LinearGain([[0.0, 0.0]])), "with a policy: pass no command"),
-        (lambda: call(spoil="initial_state"), "initial_state holds NaN"),
-        (lambda: call(spoil="exogenous"), "exogenous holds NaN"),
-        (lambda: call(spoil="command"), "command holds NaN"),
-        (
-            lambda: call(engine="magic"),
-            "engine='magic' does not exist; choose one of native, parallel, odeint_adjoint",
-        ),
-        (
-            lambda: call(policy=nn.Linear(2, 1), command=None),
-            r"policy Linear has weight in torch\.float32; .*Call policy\.double\(\)",
-        ),
-    ],
-)
-def test_wrong_arguments_are_refused(request_, message, unchecked):
-    with pytest.raises(ValueError, match=message):
-        request_()
-
-
 def test_tensors_that_come_again_are_read_anew(unchecked):
     """A rollout holds the drive of its last call, but no numbers of it."""
     plant = LinearQuadratic(horizon=1.0)
@@ -206,12 +169,6 @@ def test_tensors_that_come_again_are_read_anew(unchecked):
         native.costs(state, exogenous, command)
     with pytest.raises(ValueError, match="exogenous has shape"):
         native.costs(state, exogenous[:2], command)
-
-
-def test_single_precision_states_are_refused():
-    plant = LinearQuadratic()
-    with pytest.raises(ValueError, match=r"initial_state has shape \(1, 2\) and dtype torch\.float32.*torch\.float64"):
-        Rollout(plant, plant.closure)(torch.zeros(1, 2), *(torch.zeros(1, 5, 1).double() for _ in "zc"))
 
 
 @pytest.mark.parametrize("name, engine", trajectory.ENGINES.items())

@@ -17,7 +17,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
-from rt_torchrl.plants.actuators import LaggedActuator, ScaledActuator
+from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.sensors import UnreadInput
 from rt_torchrl.plants.vector_field import LaggedCoefficients, ScaledCoefficients
 from rt_torchrl.runs.loaded_run import config_class_of
@@ -157,27 +157,6 @@ def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixe
     assert surface - stirred[-1, 2] > 1e3
     first = (found[1:3, 2] - found[:2, 2]) / (stirred[1:3, 2] - stirred[:2, 2])
     torch.testing.assert_close(first, torch.full_like(first, 2.0), rtol=5e-3, atol=0.0)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ScaledActuator(LinearQuadratic(), "force", 0.0), "gain=0.0 of force must be positive"),
-        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind'.*does not exist.*disturbance"),
-        (lambda: UnreadInput(LinearQuadratic(), "disturbance", 1.0, ()), r"frequencies=\(\) .* must be positive"),
-        (lambda: ScaledCoefficients(LinearQuadratic(), 0.0), "gain=0.0 of the coefficients"),
-        (lambda: ScaledCoefficients(LaggedActuator(LinearQuadratic(), "force", 1.0), 0.5), "closure of the plant"),
-        (lambda: LaggedCoefficients(LinearQuadratic(), 1.0, (0.0,), elements=(2,)), "each of 2 places"),
-        (lambda: LaggedInflow(WindTurbine(), 0.0, of="torque"), "time_constant=0.0 s of the torque"),
-        (lambda: MisreadWind(WindTurbine(), 0.0), "gain=0.0 of the anemometer"),
-        (lambda: TwoZones(CryogenicTank(), 0.5, 1.0), "ratio=0.5 of the zones must be at least 1"),
-        (lambda: turbines.unknown(WindTurbine(), ("ptich",)), "ptich does not exist; choose anemometer_low"),
-        (lambda: tanks.unknown(CryogenicTank(), ("bias_5", "drift_10")), "bias_5 and drift_10 both change the press"),
-    ],
-)
-def test_what_cannot_be_made_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 @pytest.mark.parametrize(

@@ -269,9 +269,3 @@ def test_a_rotor_given_by_its_table_is_judged_by_its_own_optimum():
     # A law that has no optimum to look up is judged by the NREL rotor's.
     law = WindTurbine(closure=SaintDrenan.from_set("Heier2014"))
     assert (law.optimal_gain, law.best_tip_speed_ratio) == (nominal.optimal_gain, nominal.best_tip_speed_ratio)
-
-
-@pytest.mark.parametrize("change", [{"inertia": 0.0}, {"observe": ("rotor",)}])
-def test_wrong_arguments_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        WindTurbine(**change)

@@ -1,0 +1,101 @@
+"""Every argument that cannot be is refused in words, by ``data/refusals.txt``: its name, its value, what is allowed."""
+
+import dataclasses
+import importlib
+import math
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic
+from seeds_and_numbers import double, seeded
+from test_classical import PD
+from test_hypotheses import Suspecting
+from torch import nn
+from traced_function import sections
+
+import rt_torchrl
+from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
+from rt_torchrl.envs.cryogenic_tank import unknown as tanks
+from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+from rt_torchrl.steps.inputs import ExogenousProcess
+from rt_torchrl.trajectories.rollout import Rollout
+
+MODULES = """
+    control.command_cost control.forecasts evaluation.clairvoyant evaluation.limits
+    envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
+    envs.cryogenic_tank.saturation envs.cryogenic_tank.unknown envs.flapping_wing.closures
+    envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real
+    envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
+    envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log
+    plants.signal steps.assimilate steps.config steps.flight steps.hypotheses.ensemble systems.operating_limits
+""".split()
+"""Modules of the library whose names expressions may use beside the public ones."""
+ROWS = [row for section in sections("refusals.txt").values() for row in section.values()]
+LQ = LinearQuadratic()
+LAM, BETA, FLAT = np.array([2.0, 3.0, 3.5, 5.0, 7.5, 8.0]), np.array([-2.0, 0.0, 0.5, 4.0, 9.0]), np.zeros((6, 5))
+FITTED = {"method": "levenberg_marquardt", "inputs": "record", "initial": "estimated"}
+
+
+class Stepping(LinearQuadratic):
+    def step(self, t, state, command, exogenous, closure):
+        return super().step(t, state, command, exogenous, closure)
+
+
+def zeros(*shape):
+    return torch.zeros(shape, dtype=torch.float64)
+
+
+def text(content):
+    path = Path(tempfile.mkdtemp(), "table.csv")
+    path.write_text(content)
+    return path
+
+
+def wind_record(time, speed):
+    return WindRecord(np.asarray(time, dtype=float), np.asarray(speed, dtype=float), "r.hh")
+
+
+def ramp(duration):
+    return wind_record(np.arange(duration + 1), 5.0 + 0.0 * np.arange(duration + 1))
+
+
+def horizon(**options):
+    return RecedingHorizon(LQ, LQ.closure, PredictiveConfig(**options))
+
+
+def input_process(values):
+    signals = (dataclasses.replace(LQ.inputs[0]),)
+    return ExogenousProcess(torch.as_tensor(values).double().unsqueeze(-1), dt=0.5, signals=signals)
+
+
+def flight(*, policy=None, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1), spoil=None, **options):
+    values = {"initial_state": zeros(*state), "exogenous": zeros(*exogenous)}
+    values |= {} if command is None else {"command": zeros(*command)}
+    if spoil:
+        values[spoil].flatten()[3] = math.nan
+    return Rollout(LQ, LQ.closure, policy, **options)(**values)
+
+
+class Names(dict):
+    """The names of this file, and all of the library by need."""
+
+    def __missing__(self, name):
+        for module in (rt_torchrl, *(importlib.import_module(f"rt_torchrl.{one}") for one in MODULES)):
+            if hasattr(module, name):
+                return getattr(module, name)
+        raise KeyError(name)
+
+
+HERE = Names(globals())
+LAGGED = HERE["LAGGED"] = rt_torchrl.LaggedActuator(LQ, "force", 0.4)
+READ_BY_THE_TABLE = Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.parts[0])
+def test_it_is_refused(row, unchecked):
+    with pytest.raises(ValueError, match=row.word):
+        eval(row.parts[0], {}, HERE)
