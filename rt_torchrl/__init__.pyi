@@ -16,24 +16,16 @@ from .contract import ContractReport, PlantContractError, check_plant
 from .control.classical import ClassicalController
 
 # Real systems
-from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
+from .systems.adapters import CallingSimulator, EpisodeAbandoned, FMUEnvironment, FMUError
+from .systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
-from .systems.faulty_system import FaultySystem, Injection
-from .systems.operating_limits import OperatingLimits
-from .systems.operating_limits_config import OperatingLimitsConfig
-from .systems.operation.config import OperationConfig
-from .systems.protocols.connected_plant import ConnectedPlant
-from .systems.protocols.link import Link, LinkLostError, RefusedRequestError
-from .systems.protocols.modbus import ModbusLink
-from .systems.protocols.opc_ua import OpcUaLink
-from .systems.protocols.relay import Relay
-from .systems.protocols.served_system import served_system
-from .systems.protocols.server_process import ServerProcess
-from .systems.reading import Actuation, Reading
-from .systems.real_system import RealSystem
-from .systems.safety import SafetyConfig, SafetyLayer
-from .systems.safety_report import SafetyEvent, SafetyReport
+from .systems.machine.connected_plant import ConnectedPlant, Link, LinkLostError, RefusedRequestError
+from .systems.machine.modbus import ModbusLink, Register
+from .systems.machine.opc_ua import OpcUaLink
+from .systems.machine.rehearsal import ServerProcess, served_system
+from .systems.real_system import Actuation, Reading, RealSystem
+from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyReport
 from .evaluation.unseen import RealController
 
 # Trajectories and the twin
@@ -86,7 +78,6 @@ from .runs.run_config import Preset, RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
-from .systems.fmu_environment import FMUEnvironment, FMUError
 from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
@@ -128,13 +119,11 @@ __all__ = [
     "Extension",
     "FMUEnvironment",
     "FMUError",
-    "FaultySystem",
     "FirstController",
     "Forecast",
     "Foreseen",
     "Held",
     "HypothesesConfig",
-    "Injection",
     "LaggedActuator",
     "LaggedCoefficients",
     "Learner",
@@ -174,8 +163,8 @@ __all__ = [
     "Referee",
     "RefereeConfig",
     "RefusedRequestError",
+    "Register",
     "ReinforcementTwinning",
-    "Relay",
     "ResonantActuator",
     "Rollout",
     "Run",

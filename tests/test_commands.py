@@ -25,7 +25,7 @@ def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("compare", "export", "in_service"):
+    if name in ("compare", "export"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments

@@ -21,6 +21,7 @@ import pytest
 import torch
 from fault_counts import count
 from fault_victim import EPISODES, QUICK, SHIPPED, victim
+from faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from tensordict.nn import TensorDictModule
@@ -32,13 +33,11 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
+from rt_torchrl.systems.config import OperationConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
-from rt_torchrl.systems.operation.acting import Crew
-from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.operation.operator import Crew
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
 

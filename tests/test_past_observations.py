@@ -34,7 +34,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.protocols.served_system import served_system
+from rt_torchrl.systems.machine.rehearsal import served_system
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 

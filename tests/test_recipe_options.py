@@ -30,8 +30,8 @@ from rt_torchrl.steps.config import (
     ShortHorizonConfig,
     TwinningConfig,
 )
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 
 HEADER = "! TurbSim\n"

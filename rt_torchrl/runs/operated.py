@@ -13,11 +13,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.start import Start
-from rt_torchrl.systems.operation.acting import Crew
-from rt_torchrl.systems.operation.cores import chosen_core
-from rt_torchrl.systems.operation.event_log import EventLog
-from rt_torchrl.systems.operation.operation import Operation
-from rt_torchrl.systems.operation.order import FIRST
+from rt_torchrl.systems.operation.operator import FIRST, Crew, Operation
 from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.real_system import episode_seed
@@ -33,11 +29,9 @@ def learner_threads(config: RunConfig) -> int:
 
     Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
     """
-    options = config.operation
-    beside = config.asynchronous and options.clock == "wall"
-    if config.threads or not beside or chosen_core(options.core) is None:
+    if config.threads or not (config.asynchronous and config.operation.clock == "wall"):
         return config.threads
-    return min(torch.get_num_threads(), max(1, len(os.sched_getaffinity(0)) - 1))
+    return min(torch.get_num_threads(), max(1, (os.cpu_count() or 1) - 1))
 
 
 def acting_by_name(policies: Mapping[Role, nn.Module], first: Start | None) -> dict[str, nn.Module]:
@@ -90,7 +84,7 @@ def operation_of(
         options,
         seed=episode_seed(config.seed, NOISE),
     )
-    log = EventLog(folder / EVENTS)
+    log = folder / EVENTS
     if options.clock == "simulated":
         learning = round(options.learning * plant.n_steps)
         return SimulatedOperation(crew.operator(env), learning=learning, log=log)

@@ -10,11 +10,10 @@ from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
+from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -19,7 +19,7 @@ from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
 from rt_torchrl.runs.loggers import LoggerName, require_loggers
 from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, ShortHorizonConfig, TwinningConfig
-from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 
 SPREAD_OF_IMITATION = 0.02

@@ -8,8 +8,8 @@ from typing import Literal
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, require_widths
+from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 
 Role = Literal["model_free", "model_based"]
 Arm = Literal["twinning", "model_free", "model_based"]

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.report import findings
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operation import Operation
+from rt_torchrl.systems.operation.operator import Operation
 from rt_torchrl.systems.sound_part import (
     SHORTEST,
     EpisodeEndedError,

@@ -36,7 +36,7 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
-from rt_torchrl.systems.refusal import finite_errors, finite_transitions
+from rt_torchrl.systems.sound_part import finite_errors, finite_transitions
 
 
 @runtime_checkable

@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import check_options
-from rt_torchrl.systems.around_system import AroundSystem, require_interval
+from rt_torchrl.systems.environment import AroundSystem, require_interval
 
 CLOCK = "time"
 """Entry of the clock that a faulty system reports."""

@@ -8,7 +8,7 @@ import threading
 import time
 from typing import Any
 
-from rt_torchrl.systems.ended_process import end_process
+from rt_torchrl.systems.operation.process import end_process
 
 SIZE = 65536
 START = 30.0

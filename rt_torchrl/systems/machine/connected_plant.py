@@ -4,17 +4,15 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.systems.pace import Pace
-from rt_torchrl.systems.protocols.link import LateAnswerError, Link, LinkLostError, RefusedRequestError
+from rt_torchrl.systems.operation.operator import Pace
 
 FRESH = 0.5
 """Share of the period for which the client waits for a new sample after it was due."""
@@ -26,6 +24,58 @@ TOLERATED = 4
 """Number of late answers in a row after which a connection counts as lost."""
 AGAIN = 0.05
 """Time between two attempts to connect [s]."""
+
+
+class LinkLostError(OSError):
+    """The plant does not answer: the connection is lost, or an answer did not come in time."""
+
+
+class LateAnswerError(LinkLostError):
+    """An answer did not come in time; the connection may still be there."""
+
+
+class RefusedRequestError(ValueError):
+    """The plant answers, and refuses: a tag is unknown, may not be written, or does not take the value.
+
+    Another attempt would be refused as well; tags, types or rights must be mended.
+    """
+
+
+@runtime_checkable
+class Link(Protocol):
+    """A connection to a plant's control system. A tag is a named number there.
+
+    All methods but ``connect`` answer within a fraction of the control period, or raise. A tag that the control system
+    marks as not good is NaN; a link may say why in an attribute ``quality``, a text for each tag of the last reading
+    that is not good.
+    """
+
+    def connect(self) -> None:
+        """Connect, or connect again.
+
+        Raises:
+            LinkLostError: if the plant does not answer.
+            RefusedRequestError: if a tag is unknown there, or cannot take a number.
+        """
+
+    def read(self) -> dict[str, float]:
+        """All tags that are read, by name, in one request.
+
+        Raises:
+            LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses.
+        """
+
+    def write(self, values: Mapping[str, float]) -> None:
+        """Write tags, in one request.
+
+        Raises:
+            LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses a value.
+        """
+
+    def close(self) -> None:
+        """Close the connection, if there is one."""
 
 
 class ConnectedPlant(EnvBase):
@@ -127,14 +177,14 @@ class ConnectedPlant(EnvBase):
                     self.link.connect()
                     self._connected = True
                 self.pace.begin()
-                found = self._fresh() if self._connected else None
-                if found is not None:
-                    return self._entries(found)
+                reading = self._fresh() if self._connected else None
+                if reading is not None:
+                    return self._entries(reading)
             except LinkLostError as lost:
                 self._connected, self._lost = False, str(lost)
             self._sleep(min(AGAIN, self.pace.period))
-        said = f": {self._lost}" if self._lost else ""
-        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{said}")
+        why = f": {self._lost}" if self._lost else ""
+        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{why}")
 
     def _require_not_refused(self) -> None:
         """Raise in the control loop what the plant has refused beside it."""
@@ -149,11 +199,11 @@ class ConnectedPlant(EnvBase):
         self._require_not_refused()
         through = self._connected and self._written(values)
         self.pace.wait()
-        found = self._fresh() if self._connected else None
+        reading = self._fresh() if self._connected else None
         if not through:
-            found, self.reasons = None, {"commands": f"not written: {self._lost}"}
+            reading, self.reasons = None, {"commands": f"not written: {self._lost}"}
         ends = {"done": torch.zeros(1, dtype=torch.bool), "reward": torch.zeros(1, dtype=torch.float64)}
-        return self._entries(found).update(ends)
+        return self._entries(reading).update(ends)
 
     def _written(self, values: Mapping[str, float]) -> bool:
         """Write the commands; whether they got through."""
@@ -169,14 +219,14 @@ class ConnectedPlant(EnvBase):
         until, looks = self._clock() + FRESH * self.pace.period, 0
         try:
             while True:
-                found = self.link.read()
+                reading = self.link.read()
                 if self._sample_tag is None:
                     self._in_a_row = 0
-                    return found
-                sample = found[self._sample_tag]
+                    return reading
+                sample = reading[self._sample_tag]
                 if math.isfinite(sample) and sample != self._sample:
                     self._follow(sample, looks)
-                    return found
+                    return reading
                 looks += 1
                 if self._clock() >= until:
                     self.stale += 1
@@ -201,18 +251,18 @@ class ConnectedPlant(EnvBase):
         self._sample, self._in_a_row = sample, 0
         self.pace.shift(-EARLIER * self.pace.period if looks == 0 else None)
 
-    def _entries(self, found: dict[str, float] | None) -> TensorDict:
-        values: dict[str, Tensor] = {}
-        if found is not None:
+    def _entries(self, reading: dict[str, float] | None) -> TensorDict:
+        if reading is not None:
             quality: Mapping[str, str] = getattr(self.link, "quality", {})
             used = {tag for tags in self._entries_of.values() for tag in tags}
-            self.reasons = {tag: said for tag, said in quality.items() if tag in used}
-        for key, tags in self._entries_of.items():
-            numbers = [math.nan if found is None else found[tag] for tag in tags]
-            values[key] = torch.tensor(numbers, dtype=torch.float64)
-        gap, self._gap = self._gap, 0
-        values["skipped"] = torch.tensor([float(gap)], dtype=torch.float64)
-        return TensorDict(values, batch_size=self.batch_size)
+            self.reasons = {tag: status for tag, status in quality.items() if tag in used}
+        numbers = {
+            key: [math.nan if reading is None else reading[tag] for tag in tags]
+            for key, tags in self._entries_of.items()
+        }
+        numbers["skipped"], self._gap = [float(self._gap)], 0
+        entries = {key: torch.tensor(values, dtype=torch.float64) for key, values in numbers.items()}
+        return TensorDict(entries, batch_size=self.batch_size)
 
     def _lose(self, error: LinkLostError) -> None:
         """Note a late answer, or a lost connection, and then connect again beside the control loop."""
