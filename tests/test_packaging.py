@@ -153,6 +153,7 @@ ROOMS_OF = {
     "pareto.py": {"runs", "study"},
     "partial.py": {"runs", "study"},
     "record_log.py": {"fit", "runs"},
+    "served_turbine.py": {"runs", "systems"},
     "study.py": {"study", "runs"},
     "sweep.py": {"figures", "runs", "study"},
     "unknown.py": {"study", "runs"},
