@@ -380,7 +380,7 @@ def assert_same_episodes(whole, parts):
 def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = {}
-    exec("\n".join(blocks("policies_and_closures.md", "python")), found)
+    exec("\n".join(blocks("observations_and_costs.md", "python")), found)
     assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
 
 
