@@ -1,31 +1,10 @@
-# A heated room
+"""A heater keeps a room warm during four winter days; two_plants.md beside this file has equations and results."""
 
-An electric heater keeps a room warm during four winter days. From 7 h to 22 h the room should have 21 °C or a little more;
-energy costs at any time. The outside temperature and the sun are measured. Nobody knows how much heat leaves through window
-and wall, and how much of the sun comes in. A thermostat and a PI controller are the classical controllers. The policy to
-be learned is a perceptron, which also sees the time of the day.
-
-$$
-\begin{aligned}
-C_r\,\dot T_r &= P + g A I + U_w (T_o - T_r) \\
-&\quad + U_i (T_m - T_r) \\
-C_m\,\dot T_m &= U_i (T_r - T_m) + U_o (T_o - T_m)
-\end{aligned}
-$$
-
-with the temperatures $T_r$ of the room, $T_m$ of its walls and $T_o$ outside, the heater's power $P$ and the sun's
-irradiance $I$. The twin is to find the conductances $U$ and the solar gain $g$.
-
-The blocks of this page are one file. Save them as `heated_room.py`, and run `uv run heated_room.py`, or
-`python heated_room.py` where the library is installed. The training takes less than half a minute.
-
-## The plant
-
-```python
 import math
 from dataclasses import dataclass
 
 import torch
+
 import rt_torchrl as rt
 
 DAY, HOUR = 86400.0, 3600.0  # s
@@ -34,6 +13,8 @@ COMFORT, POWER = 21.0, 3000.0  # °C, W
 
 
 class Losses(rt.PositiveCoefficients):
+    """What nobody knows of the room: three conductances, and the share of the sun that comes in."""
+
     names = {"window_loss": "W/K", "inner_wall": "W/K", "outer_wall": "W/K", "solar_gain": "-"}
     true_coefficients = (35.0, 180.0, 40.0, 0.55)
 
@@ -45,6 +26,8 @@ SUN = rt.Signal(symbol="I", name="sun", unit="W/m^2", low=0.0)
 
 
 class HeatedRoom(rt.Plant):
+    """A room with its walls, a heater, and the weather."""
+
     name = "heated_room"
     states = (ROOM, WALL)
     actions = (rt.Signal(symbol="P", name="heater_power", unit="W", low=0.0, high=POWER),)
@@ -102,18 +85,11 @@ class HeatedRoom(rt.Plant):
         t = self.dt * torch.arange(applied.shape[-2], dtype=states.dtype)
         cold = self.occupied(t) * torch.relu(self.outside_of_comfort(states[..., :-1, :])[0])
         return {"energy [kWh/day]": 24e-3 * applied[..., 0].mean(-1), "cold by day [K h/day]": 24.0 * cold.mean(-1)}
-```
 
-A measurement may be any function `read(plant, t, state, exogenous)`. `Phase` is one: the cosine and the sine of the time
-of the day.
 
-## The classical controllers
-
-A controller with a memory says how many entries it has, such as whether the heater is on, or an integral. `self.gains` are
-its gains in the order of `gain_units`. Gains are positive; `rt_torchrl.control.classical.tune` searches them.
-
-```python
 class Thermostat(rt.ClassicalController):
+    """Switches the heater on below a band of temperatures, and off above; it remembers whether the heater is on."""
+
     gain_units = {"middle": "degC", "half_width": "K"}
     default_gains = (21.3, 0.3)
     memory_size = 1
@@ -126,6 +102,8 @@ class Thermostat(rt.ClassicalController):
 
 
 class PI(rt.ClassicalController):
+    """Power by the temperature's error and its integral, which stands still while the power is at an end."""
+
     gain_units = {"proportional": "W/K", "integral": "W/(K s)"}
     default_gains = (1500.0, 0.1)
     memory_size = 1
@@ -136,11 +114,8 @@ class PI(rt.ClassicalController):
         command = proportional * error + integral * memory
         stuck = ((command > POWER) & (error > 0.0)) | ((command < 0.0) & (error < 0.0))  # no windup
         return command, torch.where(stuck, memory, memory + self.plant.dt * error)
-```
 
-## The training
 
-```python
 TWINNING = rt.TwinningConfig(
     assimilation=rt.AssimilationConfig(method="levenberg_marquardt", inputs="record"),  # four weights, weather measured
     planner=rt.PlannerConfig(iterations=40, realisations=20, descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0)),
@@ -162,6 +137,7 @@ class Config(rt.RunConfig):
 
 
 def main(config):
+    """Check the plant, then train."""
     plant = config.plant()
     print(rt.check_plant(plant))
     rt.Run(config, plant, first=Thermostat, baselines={"thermostat": Thermostat, "PI": PI}).train()
@@ -169,25 +145,3 @@ def main(config):
 
 if __name__ == "__main__":
     rt.main_of(Config, main)
-```
-
-## What comes out
-
-The twin finds the four coefficients to nine digits in the first episode. Costs are means over 20 unseen episodes, seeds 0 to
-2 (`--seed`):
-
-| | J_a | energy [kWh/day] | cold by day [K h/day] |
-|---|---|---|---|
-| perceptron, five real episodes | 0.4016, 0.4024, 0.4017 | 28.4, 28.6, 28.4 | 0.12, 0.09, 0.11 |
-| PI | 0.4057 | 28.9 | 0.02 |
-| thermostat | 0.4214 | 29.0 | 0.74 |
-
-The policy lets the room cool down by night and begins to heat before the morning, which neither controller can know. It
-saves little: the walls hold the heat for two days.
-
-![Room temperature and heater power of the first unseen episode under the learned policy, the thermostat and the PI controller](heated_room.png)
-
-[The recipe `export.py`](export.md) takes policy, controller and twin away from the folder that the training prints at its
-end.
-
-This file has 101 lines of code. A first version, written from this documentation alone, had 147.

@@ -1,30 +1,10 @@
-# A quadrotor in a plane
+"""A quadrotor flies to a point in gusts; two_plants.md beside this file has the equations and results."""
 
-A quadrotor flies to a point while the wind gusts. Its rotors give less thrust than their data sheet says, each by
-another share, and its drag is not known. The classical controller is a linear-quadratic regulator (LQR) of the data
-sheet. The policy to be learned is an affine law of the same six measurements.
-
-$$
-\begin{aligned}
-m\dot v_x &= -F\sin\theta - c\,|v_a|\,v_{a,x} \\
-m\dot v_z &= F\cos\theta - c\,|v_a|\,v_{a,z} - mg \\
-I\ddot\theta &= \ell\,(\eta_r F_r - \eta_l F_l)
-\end{aligned}
-$$
-
-with the thrust $F = \eta_l F_l + \eta_r F_r$ and the velocity $v_a$ against the air. The twin is to find $\eta_l$, $\eta_r$
-and $c$.
-
-The blocks of this page are one file. Save them as `quadrotor.py`, and run `uv run quadrotor.py`, or `python quadrotor.py`
-where the library is installed. The training takes some ten seconds.
-
-## The plant
-
-```python
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+
 import rt_torchrl as rt
 
 MASS, INERTIA, ARM, GRAVITY = 0.5, 0.004, 0.15, 9.81  # kg, kg m², m, m/s²
@@ -32,12 +12,16 @@ TARGET, HOVER = (2.0, 2.0), 0.5 * MASS * GRAVITY  # x and z [m], thrust of a rot
 
 
 class RotorsAndDrag(rt.PositiveCoefficients):
+    """What nobody knows of the quadrotor."""
+
     names = {"left_rotor": "-", "right_rotor": "-", "drag": "N s^2/m^2"}
     meanings = {"left_rotor": "thrust over its data sheet's", "right_rotor": "thrust over its data sheet's"}
     true_coefficients = (0.85, 0.95, 0.06)
 
 
 class Quadrotor(rt.Plant):
+    """A quadrotor in a vertical plane, in gusts."""
+
     name = "quadrotor"
     states = (
         rt.Signal(symbol="x", name="position", unit="m"),
@@ -100,18 +84,11 @@ class Quadrotor(rt.Plant):
     def merit(self, states, applied, exogenous):
         away = ((states[..., :2] - states.new_tensor(TARGET)) ** 2).sum(-1).sqrt()
         return {"final distance [m]": away[..., -1]}
-```
 
-`Measurement.of(signal)` observes the state or input of that name. `state_sizes` makes metres and radians per second
-comparable where the twin is fitted.
 
-## The classical controller
-
-A controller is a class with a method `law(state, memory)`, which returns the command and the new memory. This one has
-neither memory nor gains to tune. The library limits its command to the ranges of the actions.
-
-```python
 class LQR(rt.ClassicalController):
+    """The linear-quadratic regulator of the data sheet; the library limits its command to the actions' ranges."""
+
     def __init__(self, plant, gains=None, **options):
         from scipy.linalg import solve_continuous_are
 
@@ -127,15 +104,8 @@ class LQR(rt.ClassicalController):
 
     def law(self, state, memory):
         return HOVER - (state - self.target) @ self.gain.T, memory
-```
 
-## The training
 
-With `start="controller"` the regulator flies the first real episode. The twin is fitted to it, both policies imitate it,
-and the better one acts from then on. The class `Config` and its method `plant` make the file a recipe: it has a command
-line with every [option](options.md), and `load_run` and the other recipes read its runs without further words.
-
-```python
 TWINNING = rt.TwinningConfig(
     assimilation=rt.AssimilationConfig(method="levenberg_marquardt", inputs="record"),  # three weights, gusts measured
     planner=rt.PlannerConfig(iterations=40, realisations=20, descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0)),
@@ -155,6 +125,7 @@ class Config(rt.RunConfig):
 
 
 def main(config):
+    """Check the plant, then train."""
     plant = config.plant()
     print(rt.check_plant(plant))
     rt.Run(config, plant, first=LQR, baselines={"LQR": LQR}).train()
@@ -162,28 +133,3 @@ def main(config):
 
 if __name__ == "__main__":
     rt.main_of(Config, main)
-```
-
-## What comes out
-
-The twin finds the three coefficients to nine digits in the first episode, because gusts and states are measured without
-noise. Costs are means over 20 unseen flights, seeds 0 to 2 (`--seed`):
-
-| | J_a | final distance [m] |
-|---|---|---|
-| affine policy, six real episodes | 0.8859, 0.8863, 0.8859 | 0.039, 0.029, 0.028 |
-| LQR of the data sheet | 0.9088 | 0.109 |
-
-`figures/flights.png` of the run folder shows the first unseen flight. The regulator hovers too low, as it believes in the
-data sheet; the policy has learned the thrust that the rotors really give.
-
-![Position, height and both thrusts of the first unseen flight under the learned policy and the LQR](quadrotor.png)
-
-[The recipe `export.py`](export.md) takes policy, controller and twin away from the folder that the training prints at its
-end; the controller in C maps the six
-measured states to the two thrusts.
-
-To try more: `--policy mlp` for a perceptron, `--noise 0.01` for noisy sensors, and [an early
-end](real_system.md#episodes-that-end-early) where the quadrotor hits the ground.
-
-This file has 97 lines of code. A first version, written from this documentation alone, had 154.
