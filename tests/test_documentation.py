@@ -15,7 +15,6 @@ from printed_commands import ROOT, TEXTS, blocks
 from tensordict import TensorDict
 from test_export_recipe import RECIPES, leave_run, recipe
 
-import rt_torchrl
 from rt_torchrl import check_plant, load_run
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.contract.check import require_controller
@@ -98,12 +97,9 @@ def test_the_real_turbine_has_what_its_twin_does_not_know():
     assert len(scope["real"].states) > len(scope["twin"].states)
 
 
-def test_the_what_if_of_the_readme_runs(tmp_path):
-    (shown,) = blocks("README.md", "py")
-    scope = {"rt_torchrl": rt_torchrl, "wind": torch.full((20, 1), 11.0)}
-    exec(shown.replace("runs/wind_turbine/TIME-seed-0", str(leave_finished_run(tmp_path / "run"))), scope)
-    assert len(scope["flown"].states) == 21
-    assert not any(blocks(page, "py") for page in TEXTS if page != "README.md")  # which would not be run
+def test_every_block_of_code_is_marked_as_python():
+    """A block in another spelling of the language would not be run."""
+    assert not any(blocks(page, "py") for page in TEXTS)
 
 
 def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
@@ -143,7 +139,7 @@ def test_every_public_name_has_an_entry():
 
 
 def test_the_front_page_is_short():
-    assert len(TEXTS["README.md"].splitlines()) <= 200
+    assert len(TEXTS["README.md"].splitlines()) <= 130
 
 
 @pytest.mark.nightly  # .ci/run builds the site in every run; this is for those who run no .ci/run
