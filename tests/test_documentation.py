@@ -173,9 +173,17 @@ def test_its_code_runs(monkeypatch):
     assert scope["report"]["real_cost"] > 0
 
 
+def headings(page):
+    """The anchors of a page, as its renderers make them of its headings."""
+    found = re.findall(r"^#+ (.+)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in found}
+
+
 def test_its_files_exist():
-    for path in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
-        assert (ROOT / path).exists(), path
+    for link in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
+        path, _, heading = link.partition("#")
+        assert (ROOT / path).exists(), link
+        assert not heading or heading in headings(path), link
 
 
 @pytest.mark.slow
