@@ -121,6 +121,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run docs/quadrotor.py", "uv run docs/heated_room.py"}  # tests/test_documentation.py
     known |= {"uv run tests/ruler.py"}  # tests/test_study.py
+    known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
     known |= {f"{PYTEST} -m faults", "uv run --group test --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
     assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
