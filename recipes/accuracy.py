@@ -17,9 +17,9 @@ import torch
 from torch import nn
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, Trajectory, check_options, load_run, main_of
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.runs.tensor_file import load_tensors
+from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.trajectories.trajectory import batch_of
@@ -122,13 +122,13 @@ class OverBest(NamedTuple):
 
 def over_best(training: Training, unseen: int) -> OverBest:
     """How the law of a training's twin compares with the best ones of its form."""
-    from rt_torchrl.runs.checkpoint import NAME  # here, because --help need not wait for TorchRL
+    from rt_torchrl.runs.run_folder import CHECKPOINT  # here, because --help need not wait for TorchRL
     from rt_torchrl.steps.flight import ShortTermMemory
 
     run, count = load_run(training.folder), EPISODES[training.plant]
     memory = ShortTermMemory(count)
     memory.load_state_dict(
-        load_tensors(training.folder / NAME)["state"]["algorithm"]["module.interact._extra_state"]["short_term"]
+        load_tensors(training.folder / CHECKPOINT)["state"]["algorithm"]["module.interact._extra_state"]["short_term"]
     )
     policy, seen = run.policies["model_based"], batch_of(memory)
     episodes = UnseenEpisodes(run.plant, unseen)

@@ -13,8 +13,8 @@ import numpy as np
 from wind_turbine import Config as Turbine
 
 from rt_torchrl import OperationConfig, check_options, main_of, require_finished
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.runs.results_file import make_folder, write_results
 
 HOUR = 3600.0
 

@@ -35,8 +35,8 @@ class Config:
 
 
 def main(config: Config) -> None:
+    from rt_torchrl.atomic_file import make_folder
     from rt_torchrl.figures import save_figure
-    from rt_torchrl.runs.results_file import make_folder
     from rt_torchrl.study.comparison import comparison_figure, comparison_table, entries_of
 
     make_folder("picture", config.picture.parent)

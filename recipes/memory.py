@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from rt_torchrl import check_options, main_of, require_finished
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.results_file import make_folder, write_results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,10 +10,10 @@ if __name__ == "__main__":
     begin_loading()
 
 from rt_torchrl import ClassicalController, check_options, main_of
+from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.runs.results_file import make_folder
 from rt_torchrl.study.pareto import Effort, Point, classical_point, keep, pareto_front
 
 

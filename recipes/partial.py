@@ -11,7 +11,7 @@ if __name__ == "__main__":
     begin_loading()
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 

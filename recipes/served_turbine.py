@@ -16,8 +16,8 @@ from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures
 
 from rt_torchrl import OperationConfig, main_of
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.runs.results_file import make_folder, write_results
 
 SAFE = (2e4, 20.0)
 """Torque [N m] and pitch [deg] that slow the rotor down in any wind, and do not stop it."""

@@ -13,8 +13,8 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import check_options, main_of
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
-from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.cases import UNSEEN, names, optimum, options_of
 from rt_torchrl.study.results import numeric
 from rt_torchrl.study.room import Room, require_page, room_table, write_into

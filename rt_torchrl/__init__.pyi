@@ -69,13 +69,10 @@ from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Star
 from .interruption import require_finished
 from .loading import begin_loading
 from .options import check_options
-from .runs.callbacks import EarlyStopping
-from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
-from .runs.machine import require_device
 from .runs.run import Run
-from .runs.run_config import Preset, RunConfig
-from .runs.shipped_plants import shipped_plants
+from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
+from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
 from .export.fmu import export_policy_fmu, export_twin_fmu

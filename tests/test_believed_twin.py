@@ -15,7 +15,7 @@ from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveCo
 from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import BiasedSensor
-from rt_torchrl.runs.results_table import hypothesis_lines, results_table
+from rt_torchrl.runs.results import hypothesis_lines, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, extended

@@ -14,8 +14,7 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_settings import as_written
-from rt_torchrl.runs.settings import config_of
+from rt_torchrl.runs.settings import as_written, config_of
 from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv

@@ -12,7 +12,7 @@ from printed_commands import ROOT, TEXTS, commands, options, spans
 
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
@@ -40,7 +40,7 @@ NO_OPTIONS = ROOT / "tests" / "no_options.json"
 @pytest.fixture(autouse=True)
 def _with_every_logger(monkeypatch):
     """As if the packages that the documentation tells to install were there."""
-    monkeypatch.setattr("rt_torchrl.runs.loggers.PACKAGES", {})
+    monkeypatch.setattr("rt_torchrl.runs.run_config.PACKAGES", {})
 
 
 def refusal(name, arguments):

@@ -16,7 +16,7 @@ from printed_commands import ROOT, commands
 from test_pendulum import require_quiet
 
 from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 
 pytestmark = pytest.mark.slow
 TRAININGS = [

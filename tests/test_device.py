@@ -19,7 +19,7 @@ from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
+from rt_torchrl.runs.run_folder import load_tensors, save_tensors
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, ShortHorizonConfig
 
 

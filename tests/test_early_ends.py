@@ -26,7 +26,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.operated import operation_of
+from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig

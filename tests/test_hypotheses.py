@@ -13,8 +13,7 @@ from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.runs.results import hypotheses_of, twin_entries
-from rt_torchrl.runs.results_table import hypothesis_lines, progress
+from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, progress, twin_entries
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.assimilate import Assimilation

@@ -14,7 +14,7 @@ from small_runs import SMALL, small_run
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.operated import learner_threads
+from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig

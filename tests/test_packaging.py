@@ -182,7 +182,7 @@ def imports_of_rooms(code):
             continue
         for module, name in found:
             parts = module.split(".")
-            if parts[0] == "rt_torchrl" and parts[1:2] not in ([], ["envs"]):
+            if parts[0] == "rt_torchrl" and parts[1:2] not in ([], ["atomic_file"], ["envs"]):
                 yield module, name
 
 

@@ -15,12 +15,12 @@ from rt_torchrl.algorithm import ReinforcementTwinning, share_critic
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.figures.policy import policy_contours
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig, ShortHorizonConfig
 from rt_torchrl.steps.imitation import Imitation
@@ -204,7 +204,7 @@ def test_a_checkpoint_of_another_method_does_not_fit(tmp_path):
     config = Config(episodes=1, log_dir=tmp_path / "other", compiled=False, twinning=SMALL)
     other = Run(config, config.plant())
     with pytest.raises(ValueError, match="do not fit"):
-        checkpoint.load(tmp_path / "checkpoint.pt", other.algorithm)
+        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", other.algorithm)
     other._held.release()
 
 

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl.export.program import export_program
-from rt_torchrl.runs.configured_plant import physics_of
+from rt_torchrl.runs.run_config import physics_of
 from rt_torchrl.systems.machine.connected_plant import ConnectedPlant, LinkLostError
 from rt_torchrl.systems.machine.modbus import ModbusLink, Register
 from rt_torchrl.systems.machine.rehearsal import (

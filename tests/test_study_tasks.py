@@ -14,8 +14,7 @@ from handwritten_study import RECIPES, WRITE_RESULTS, finished, recipe, training
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.shipped_plants import shipped_plants
+from rt_torchrl.runs.command_line import from_command_line, load_recipe, shipped_plants
 from rt_torchrl.study import scheduling, yardsticks
 from rt_torchrl.study.results import yardstick_entry
 from rt_torchrl.study.scheduling import on_this_machine, side_by_side

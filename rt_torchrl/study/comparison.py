@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, ROLES, caption, legend_below, panels
+from rt_torchrl.runs.results import judged_on_the_system, on_the_twin
 from rt_torchrl.runs.settings import BESIDE, read_settings
-from rt_torchrl.runs.summary import judged_on_the_system, on_the_twin
 from rt_torchrl.study.results import Entry, merit_means, numbers
 
 APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")

@@ -11,13 +11,12 @@ import torch
 from torch import nn
 
 from rt_torchrl import figures
+from rt_torchrl.atomic_file import write_results
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.limits import Optimum, exact_optimum
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs.configured_plant import physics_of, plant_of
-from rt_torchrl.runs.results_file import write_results
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import RunConfig, physics_of, plant_of
 from rt_torchrl.study.yardsticks import TRAINING_SEED, Options, configured
 
 

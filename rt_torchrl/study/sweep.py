@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.results import judged_on_the_system
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.runs.summary import judged_on_the_system
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import options_of, require_options, written_in
 

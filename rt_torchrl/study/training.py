@@ -9,8 +9,7 @@ from typing import Any
 from rt_torchrl.interruption import Interrupted
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_settings import differences
-from rt_torchrl.runs.settings import FILE
+from rt_torchrl.runs.settings import FILE, differences
 from rt_torchrl.steps.config import Arm
 from rt_torchrl.study.json_file import read_json
 

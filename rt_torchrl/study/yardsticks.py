@@ -22,8 +22,7 @@ from rt_torchrl.evaluation.limits import (
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.configured_plant import physics_of, plant_of
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import RunConfig, physics_of, plant_of
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 
