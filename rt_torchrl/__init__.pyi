@@ -29,7 +29,7 @@ from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyRep
 from .evaluation.unseen import RealController
 
 # Trajectories and the twin
-from .steps.config import LearnerConfig, LongTermMemoryConfig
+from .steps.config import LearnerConfig
 from .steps.learn import ActorCritic, Learner, LearningMethod
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
@@ -56,7 +56,6 @@ from .steps.config import (
     HypothesesConfig,
     PlannerConfig,
     RefereeConfig,
-    ShortHorizonConfig,
     TwinningConfig,
 )
 from .steps.hypotheses.ensemble import TwinEnsemble
@@ -131,7 +130,6 @@ __all__ = [
     "LinkLostError",
     "LoadedRun",
     "LogConfig",
-    "LongTermMemoryConfig",
     "Measurement",
     "ModbusLink",
     "Named",
@@ -180,7 +178,6 @@ __all__ = [
     "SensorRecord",
     "ServerProcess",
     "ShortHorizon",
-    "ShortHorizonConfig",
     "Signal",
     "SmoothClip",
     "Snapshot",

@@ -30,7 +30,7 @@ def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
             "realisations": 2,
             "virtual_episodes": 3,
             "learner": LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
-            "assimilation": AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+            "assimilation": AssimilationConfig(iterations=2),
             "planner": PlannerConfig(iterations=2, starts=0, descent=DescentConfig(rate=0.01)),
             **options,
         }
@@ -228,7 +228,7 @@ def test_identification_finds_the_true_closure():
     found = twinning(
         plant,
         arm="model_based",
-        assimilation=AssimilationConfig(iterations=80, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+        assimilation=AssimilationConfig(iterations=80, method="lbfgs"),
         exploration=ExplorationConfig(spread=0.5, episodes=5),
     )
     report = flown(found, "interact", "inputs", "assimilate")

@@ -40,7 +40,7 @@ def run(tmp_path_factory):
     """A training of one episode, in which the right hypothesis takes over."""
     folder = tmp_path_factory.mktemp("believed")
     assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
-    hypotheses = HypothesesConfig(call=0.0, names=("lags",))
+    hypotheses = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
     options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
     config = Config(episodes=1, log_dir=folder, twinning=twinning, **options)

@@ -70,7 +70,7 @@ def test_the_suspects_of_the_tutorial_plant_are_plants():
     assert list(found) == ["pump lags", "pump late"] and all(len(plant.states) > 2 for plant in found.values())
     assert list(scope["LeakyTank"]().suspects()) == [*found, "leaks"]
     tank = scope["SuspiciousTank"]()
-    twin = make_twin(tank, tank.closure, HypothesesConfig(names=("unknown flow", "pump lags")))
+    twin = make_twin(tank, tank.closure, HypothesesConfig(which=("unknown flow", "pump lags")))
     assert set(twin.twins) == {ALONE, "unknown flow", "pump lags"}
 
 
@@ -82,7 +82,7 @@ def test_the_extension_of_the_documentation_finds_a_leak():
     commands = 2e-4 * torch.rand(1, tank.n_steps, 1, generator=generator, dtype=torch.float64)
     drawn = real.draw_initial_state(1, generator), real.draw_exogenous(1, generator)
     record = [part[0] for part in Rollout(real, real.closure)(*drawn, commands)[:3]]
-    config = HypothesesConfig(call=0.0, names=("leaks", "pump lags"))
+    config = HypothesesConfig(call=0.0, which=("leaks", "pump lags"))
     twin = make_twin(tank, tank.make_closure(generator), config)
     fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
     make_assimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)

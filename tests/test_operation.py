@@ -43,7 +43,7 @@ def small(exploration):
         virtual_episodes=3,
         exploration=exploration,
         learner=LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
-        assimilation=AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+        assimilation=AssimilationConfig(iterations=2),
         planner=PlannerConfig(iterations=2, descent=DescentConfig(rate=0.01)),
     )
 
@@ -331,16 +331,6 @@ def test_model_predictive_control_acts_while_the_twin_learns_and_goes_on_after_a
     for one, other in zip(whole, resumed, strict=True):
         assert one["late_solves"] == 0.0 < one["solve_median"]
         assert {k: v for k, v in one.items() if k not in times} == {k: v for k, v in other.items() if k not in times}
-
-
-def test_model_predictive_control_that_asks_a_critic_is_refused(tmp_path):
-    from test_predictive_training import PLANNER
-
-    planner = dataclasses.replace(
-        PLANNER, receding_horizon=dataclasses.replace(PLANNER.receding_horizon, terminal="critic")
-    )
-    with pytest.raises(ValueError, match=r"receding_horizon.terminal='critic' does not go with asynchronous"):
-        operated(tmp_path, twinning=dataclasses.replace(SMALL, planner=planner))
 
 
 # An operation in a process of its own, with true clocks, and whole runs of it.

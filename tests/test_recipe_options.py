@@ -24,10 +24,8 @@ from rt_torchrl.steps.config import (
     AssimilationConfig,
     ExogenousConfig,
     LearnerConfig,
-    LongTermMemoryConfig,
     PlannerConfig,
     RefereeConfig,
-    ShortHorizonConfig,
     TwinningConfig,
 )
 from rt_torchrl.systems.config import SafetyConfig
@@ -151,22 +149,22 @@ def test_a_plant_without_a_paper_has_no_words_of_it():
 
 
 @pytest.mark.parametrize(
-    ("words", "spread", "starts"),
+    ("words", "spread", "rate"),
     [
-        ([], 0.02, 32),
-        (["--start", "random"], 0.2, 32),
-        (["--preset", "paper"], 0.2, 0),
-        (["--starts", "random", "--episodes", "0"], 0.02, 32),  # what cannot be carried out
+        ([], 0.02, 0.01),
+        (["--start", "random"], 0.2, 0.01),
+        (["--preset", "paper"], 0.2, 0.02),
+        (["--starts", "random", "--episodes", "0"], 0.02, 0.01),  # what cannot be carried out
     ],
 )
-def test_the_help_shows_the_defaults_that_hold(words, spread, starts, capsys):
+def test_the_help_shows_the_defaults_that_hold(words, spread, rate, capsys):
     config = config_class_of(RECIPES / "wind_turbine.py")
     with pytest.raises(SystemExit) as ended:
         from_command_line(config, [*words, "--help"])
     printed = capsys.readouterr()
     assert ended.value.code == 0 and not printed.err
     said = " ".join(printed.out.replace("│", " ").split())
-    for option, value in (("exploration.spread FLOAT", spread), ("planner.starts INT", starts)):
+    for option, value in (("exploration.spread FLOAT", spread), ("learner.target-rate FLOAT", rate)):
         described = said.split(f"--twinning.{option}")[1].split(" --")[0]
         assert f"(default: {value})" in described
 
@@ -237,16 +235,15 @@ CONFIGS = {
     EstimationConfig: {"errors": "newton", "prior": math.inf, "rounds": math.nan, "iterations": math.nan},
     ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
-    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},
-    LongTermMemoryConfig: {"capacity": math.inf, "correction": math.nan},
-    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "experience": math.inf},
+    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "stall": math.nan},
+    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "window": math.nan},
     LearnerConfig: {
         "critic_rate": math.inf,
         "batch_size": math.nan,
         "critic_hidden": (8, 0),
         "reward_scale": math.inf,
+        "memory_capacity": math.inf,
     },
-    ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_iterations": 0.5},
     ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
     SafetyConfig: {"interval": "0.5"},
     partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan, "patience": True},

@@ -154,21 +154,15 @@ def operation_of(
         folder: run folder, for the log of the events.
 
     Raises:
-        ValueError: if episodes of the plant may end early; if model predictive control is to ask the critic; on the
-            wall clock, if there is no function that makes the real system, the device is not the CPU, or what acts
-            cannot be sent to another process.
+        ValueError: if episodes of the plant may end early; on the wall clock, if there is no function that makes the
+            real system, the device is not the CPU, or what acts cannot be sent to another process.
     """
     if plant.end_cost is not None:
         raise ValueError(
             f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
             "--asynchronous."
         )
-    options, planner = config.operation, config.twinning.planner
-    if planner.method == "receding_horizon" and planner.receding_horizon.terminal == "critic":
-        raise ValueError(
-            "twinning.planner.receding_horizon.terminal='critic' does not go with asynchronous: the critic goes on "
-            "learning while the controller acts. Use terminal plant."
-        )
+    options = config.operation
     crew = Crew(
         make_env or (lambda: env),
         plant,

@@ -139,8 +139,8 @@ class Run:
             beside the policies wherever the unseen episodes are flown under the true closure.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
-        replay: function of ``config.twinning.learner.memory`` and ``generator=`` that makes the memory of
-            :class:`ActorCritic`, if there is no ``learner``.
+        replay: function of ``config.twinning.learner.memory_capacity``, ``correction=`` and ``generator=`` that makes
+            the memory of :class:`ActorCritic`, if there is no ``learner``.
         planner: function of twin, policy, ``config.twinning.planner`` and ``generator=`` that makes the planner of step
             5, a :class:`Planner`.
         referee: function of ``config.twinning.referee`` and the role that starts live that makes the referee of step 6,

@@ -17,7 +17,7 @@ from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.options import check_options, choices, require_widths, with_paths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
-from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, ShortHorizonConfig, TwinningConfig
+from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, TwinningConfig
 from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 
@@ -336,7 +336,7 @@ class RunConfig:
         Hypotheses replay the whole state, and are left out where the twin is fitted to some sensors alone.
         """
         if self.twinning.assimilation.sensors:
-            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which="none"))
+            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which=("none",)))
         if self.start == "random":
             return twinning
         exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
@@ -354,7 +354,7 @@ class RunConfig:
         )
         if preset == "mpc":
             planner = found.twinning.planner
-            planner = dataclasses.replace(planner, method="receding_horizon", short_horizon=ShortHorizonConfig())
+            planner = dataclasses.replace(planner, method="receding_horizon")
             found = dataclasses.replace(found, twinning=dataclasses.replace(found.twinning, planner=planner))
         begun = self if self.start != usual.start else dataclasses.replace(self, start=found.start)
         return dataclasses.replace(found, twinning=begun.suited(found.twinning))

@@ -1,6 +1,5 @@
 """What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -60,8 +59,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         law = controller(plant)
         return lambda physics, closure: FirstController(law.to(_device_of(physics, closure)))
     if name == "mpc":
-        # No critic has learned anything yet that could price the end of a window.
-        options = dataclasses.replace(config.twinning.planner.receding_horizon, terminal="plant")
+        options = config.twinning.planner.receding_horizon
         return lambda physics, closure: FirstController(PredictiveControl(physics, closure, options))
     path = Path(name)
     if path.is_dir():
@@ -141,7 +139,7 @@ def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant)
             return None
         raise ValueError(
             f"start={str(folder)!r} is a run that believes {its.hypothesis!r}, but {error} Give the "
-            "--twinning.hypotheses.names of that run, or --twinning.hypotheses.which none to plan on the twin alone."
+            "--twinning.hypotheses.which of that run, or --twinning.hypotheses.which none to plan on the twin alone."
         ) from error
     return found
 
