@@ -37,12 +37,11 @@ napoleon_google_docstring, napoleon_numpy_docstring, napoleon_use_rtype = True, 
 html_theme = "pydata_sphinx_theme"
 html_title = "rt_torchrl"
 html_show_sourcelink = False
-html_sidebars = dict.fromkeys(("results", "gallery", "changelog", "contributing"), [])  # they stand in no section
+html_sidebars = {"**": ["globaltoc"]}
 html_theme_options = {
     "show_toc_level": 2,
     "navigation_with_keys": False,
-    "navbar_align": "left",
-    "header_links_before_dropdown": 6,
+    "navbar_center": [],
     "footer_end": [],
     "pygments_light_style": "tango",
 }

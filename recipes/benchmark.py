@@ -25,7 +25,7 @@ from benchmarking.timing import Cell, Stopwatch
 from benchmarking.trainings import seconds_of_steps
 
 from rt_torchrl import Engine, main_of
-from rt_torchrl.runs.results_file import new_folder
+from rt_torchrl.atomic_file import new_folder
 from rt_torchrl.trajectories.rollout import ENGINES
 
 SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0, "updates": 1.0}

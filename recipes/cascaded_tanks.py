@@ -31,12 +31,12 @@ from rt_torchrl import (
     main_of,
     sensors_of,
 )
+from rt_torchrl.atomic_file import write_results
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
 from rt_torchrl.fit.likelihood import Likelihood
 from rt_torchrl.fit.uncertainty import inverse_information
-from rt_torchrl.runs.results_file import write_results
 
 VIRTUAL, UNSEEN = 20, 100
 """Numbers of virtual episodes that a plan is made on, and judged on."""

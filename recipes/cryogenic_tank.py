@@ -86,7 +86,7 @@ NEURAL = dataclasses.replace(
     assimilation=AssimilationConfig(
         iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
     ),
-    hypotheses=HypothesesConfig(which="none"),
+    hypotheses=HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 

@@ -99,7 +99,7 @@ NEURAL = dataclasses.replace(
     assimilation=AssimilationConfig(
         iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
     ),
-    hypotheses=HypothesesConfig(which="none"),
+    hypotheses=HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 

@@ -15,6 +15,7 @@ import torch
 import tyro
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, check_options, main_of, read_log
+from rt_torchrl.atomic_file import new_folder, write_results
 from rt_torchrl.fit.least_squares import Identified, identify
 from rt_torchrl.fit.log import Column, checked
 from rt_torchrl.fit.resampling import (
@@ -28,10 +29,9 @@ from rt_torchrl.fit.resampling import (
     sensors_in,
 )
 from rt_torchrl.fit.sensors import with_biases
+from rt_torchrl.runs.command_line import plant_class
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.results_file import new_folder, write_results
-from rt_torchrl.runs.shipped_plants import plant_class
-from rt_torchrl.runs.tensor_file import save_tensors
+from rt_torchrl.runs.run_folder import save_tensors
 
 
 @dataclass(frozen=True, kw_only=True)

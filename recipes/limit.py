@@ -25,6 +25,7 @@ from rt_torchrl import (
     load_run,
     main_of,
 )
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -42,8 +43,7 @@ from rt_torchrl.evaluation.limits import (
 )
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.configured_plant import plant_of
-from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.runs.run_config import plant_of
 
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "wind_turbine": {"Jonkman": JonkmanController},

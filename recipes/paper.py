@@ -20,7 +20,16 @@ from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss
 
-from rt_torchrl import DigitalTwin, LearnerConfig, Plant, PlantEnv, RunConfig, identification_cost, main_of
+from rt_torchrl import (
+    DescentConfig,
+    DigitalTwin,
+    LearnerConfig,
+    Plant,
+    PlantEnv,
+    RunConfig,
+    identification_cost,
+    main_of,
+)
 from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
@@ -58,7 +67,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
     closure = options.make_closure(plant, generator)  # l. 3
     twin = DigitalTwin(plant, closure)
     learner = DDPG(plant, policies["model_free"], table.learner, generator)  # l. 2, with D_L of l. 4
-    fit, plan = Descent(closure, table.assimilation.descent), Descent(policies["model_based"], table.planner.descent)
+    fit, plan = Descent(closure, DescentConfig()), Descent(policies["model_based"], table.planner.descent)
     acting = LivePolicy(plant, policies[live], table.exploration, generator=generator)
     collector = collector_of(PlantEnv(plant, seed=options.seed), acting, plant)
     worse, stalled = 0, 0  # C_π and C_w of l. 5
@@ -108,7 +117,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
         with torch.no_grad():
             cost = {role: twin.cost(policy, start, z).item() for role, policy in policies.items()}
         event, referee = "keep", table.referee
-        if cost[live] > referee.tolerance * cost[idle]:
+        if cost[live] > cost[idle]:
             worse, stalled = worse + 1, 0
             if worse > referee.patience:
                 event, worse = "swap", 0
@@ -135,7 +144,7 @@ class DDPG:
     """π_mf, its critic q and the memory D_L; line 17 has no target network, and relaxes the critic itself."""
 
     def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, generator: torch.Generator):
-        self.config, self.memory = config, LongTermMemory(config.memory, generator=generator)
+        self.config, self.memory = config, LongTermMemory(config.memory_capacity, correction=0.0, generator=generator)
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.actor = ScaledPolicy(plant, policy, stochastic=False, device=generator.device)
         widths = (len(plant.observations) + len(plant.actions), *config.critic_hidden)

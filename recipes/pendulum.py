@@ -16,7 +16,6 @@ from rt_torchrl import (
     LearnerConfig,
     PlannerConfig,
     RunConfig,
-    ShortHorizonConfig,
     TwinningConfig,
     main_of,
     require_device,
@@ -31,7 +30,7 @@ SWING_UP = TwinningConfig(
     # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
     assimilation=AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
     # Tiny changes decide whether a swing reaches the top: over whole episodes, descent stops in a local minimum.
-    planner=PlannerConfig(iterations=10, realisations=64, short_horizon=ShortHorizonConfig(window=25)),
+    planner=PlannerConfig(method="short_horizon", iterations=10, realisations=64),
 )
 
 

@@ -21,8 +21,8 @@ from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.fit.log import SensorLog, logged_states
-from rt_torchrl.runs.shipped_plants import plant_class
-from rt_torchrl.runs.tensor_file import load_tensors
+from rt_torchrl.runs.command_line import plant_class
+from rt_torchrl.runs.run_folder import load_tensors
 
 CONTROLLERS: dict[str, type[ClassicalController]] = {
     "wind_turbine": JonkmanController,

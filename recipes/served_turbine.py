@@ -1,8 +1,10 @@
-"""Reinforcement twinning of a wind turbine that is served over OPC UA or Modbus, while it operates."""
+"""A wind turbine served over OPC UA or Modbus: reinforcement twinning while it operates, or a policy at work."""
 
 import contextlib
+import time
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 from rt_torchrl import begin_loading
@@ -14,6 +16,7 @@ from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures
 
 from rt_torchrl import OperationConfig, main_of
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 
 SAFE = (2e4, 20.0)
@@ -37,6 +40,10 @@ class Config(Turbine):
         port: port of the server on this machine.
         connect: whether a server runs already, started with serve; it must have the same dt, pace and observe.
         serve: whether to run the server alone, until Ctrl-C.
+        act: exported policy that acts for one horizon, without a learner: an ONNX model (.onnx, with the extra onnx),
+            or with trusted a PyTorch program (.pt2) or C (.c, with a C compiler). The results, in_service.json, and the
+            events of the safety layer, safety.jsonl, go to log_dir.
+        trusted: whether a .pt2 or .c file may run its code, because you know who has written it.
         pace: seconds of the turbine for each second: with the default, the control period of 0.5 s lasts 0.02 s.
         safe: generator torque [N m] and blade pitch [deg] that the turbine's own watchdog brings, and the client's
             fallback.
@@ -48,6 +55,8 @@ class Config(Turbine):
     port: int = 5020
     connect: bool = False
     serve: bool = False
+    act: Path | None = None
+    trusted: bool = False
     pace: float = 25.0
     safe: tuple[float, float] = SAFE
 
@@ -66,49 +75,60 @@ class Config(Turbine):
     def usual_operation() -> OperationConfig:
         return in_operation()
 
-    @property
-    def period(self) -> float:
-        """Wall-clock time of a control interval [s]."""
-        return self.dt / self.pace
-
-
-def server_of(config: Config):
-    """The context in which the turbine is in operation in a process of its own."""
-    from rt_torchrl import ServerProcess
-
-    options = {"protocol": config.protocol, "port": config.port, "period": config.period, "seed": config.seed}
-    return ServerProcess(config.plant(), config.safe, **options)
+    def served(self) -> dict[str, Any]:
+        """Arguments of server and client."""
+        return {"safe": self.safe, "protocol": self.protocol, "port": self.port, "period": self.dt / self.pace}
 
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run, served_system  # here, because --help need not wait for TorchRL
+    from rt_torchrl import Run, ServerProcess, served_system  # here, because --help need not wait for TorchRL
 
-    if config.serve:
-        return serve_alone(config)
     plant = config.plant()
-    env = partial(
-        served_system,
-        plant,
-        safe=config.safe,
-        protocol=config.protocol,
-        port=config.port,
-        period=config.period,
-        closure=plant.closure,
-    )
-    with contextlib.nullcontext() if config.connect else server_of(config):
+    server = contextlib.nullcontext() if config.connect else ServerProcess(plant, **config.served(), seed=config.seed)
+    with server:
+        if config.serve:
+            print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
+            while True:
+                time.sleep(1.0)
+        if config.act is not None:
+            act(config, config.act)
+            return
+        env = partial(served_system, plant, **config.served(), closure=plant.closure)
         Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController, **parts).train()
-    return None
 
 
-def serve_alone(config: Config) -> None:
-    """Serve the turbine until Ctrl-C."""
-    import time
+def act(config: Config, file: Path) -> None:
+    """Let an exported policy act for one horizon, and write what came of it."""
+    import torch
 
-    with server_of(config):
-        print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
-        while True:
-            time.sleep(1.0)
+    from rt_torchrl import ExplorationConfig, load_policy, served_system
+    from rt_torchrl.systems.collectors import EpisodeCollector
+    from rt_torchrl.systems.exploration import LivePolicy
+
+    torch.set_num_threads(1)
+    folder, plant = config.log_dir or Path("runs/in_service"), config.plant()
+    make_folder("log_dir", folder)
+    policy, log = load_policy(file, plant, trusted=config.trusted), folder / "safety.jsonl"
+    log.unlink(missing_ok=True)
+    actor = LivePolicy(plant, policy, ExplorationConfig(episodes=0), generator=torch.Generator())
+    actor.begin(policy, strength=0.0)
+    system = served_system(plant, **config.served(), log=log)
+    with contextlib.closing(system):
+        episode = EpisodeCollector(system, actor, plant).rollout()[0]
+    client = system.env.env
+    results = {
+        "J_a": -episode["next", "reward"].mean().item(),
+        "intervals": float(plant.n_steps),
+        "refused": float(episode["next", "refused"].sum()),
+        "skipped": float(client.skipped),
+        "late_answers": float(client.late),
+        "lost_connections": float(client.losses),
+    }
+    path = write_results(folder / "in_service.json", {"config": config, **results})
+    for name, value in results.items():
+        print(f"{name.replace('_', ' '):<24}{value:.6g}")
+    print(f"results in {path}")
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ DEFAULT = TwinningConfig(
     # Fits and plans converge over the episodes. The wind is the measured one, because draws of it leave an error in the
     # closure, and the plans 1 to 2 % above the optimum. While the first closures are wrong, a plan of a hundred
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
-    assimilation=AssimilationConfig(iterations=60, inputs="record", descent=LBFGS),
+    assimilation=AssimilationConfig(iterations=60, method="lbfgs", inputs="record"),
     planner=PlannerConfig(
         iterations=25,
         realisations=50,
@@ -71,7 +71,7 @@ NEURAL = dataclasses.replace(
     assimilation=AssimilationConfig(
         iterations=10, method="levenberg_marquardt", inputs="record", segment=20, prior=0.02
     ),
-    hypotheses=HypothesesConfig(which="none"),
+    hypotheses=HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 

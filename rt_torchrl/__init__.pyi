@@ -16,28 +16,20 @@ from .contract import ContractReport, PlantContractError, check_plant
 from .control.classical import ClassicalController
 
 # Real systems
-from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
+from .systems.adapters import CallingSimulator, EpisodeAbandoned, FMUEnvironment, FMUError
+from .systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
-from .systems.faulty_system import FaultySystem, Injection
-from .systems.operating_limits import OperatingLimits
-from .systems.operating_limits_config import OperatingLimitsConfig
-from .systems.operation.config import OperationConfig
-from .systems.protocols.connected_plant import ConnectedPlant
-from .systems.protocols.link import Link, LinkLostError, RefusedRequestError
-from .systems.protocols.modbus import ModbusLink
-from .systems.protocols.opc_ua import OpcUaLink
-from .systems.protocols.relay import Relay
-from .systems.protocols.served_system import served_system
-from .systems.protocols.server_process import ServerProcess
-from .systems.reading import Actuation, Reading
-from .systems.real_system import RealSystem
-from .systems.safety import SafetyConfig, SafetyLayer
-from .systems.safety_report import SafetyEvent, SafetyReport
+from .systems.machine.connected_plant import ConnectedPlant, Link, LinkLostError, RefusedRequestError
+from .systems.machine.modbus import ModbusLink, Register
+from .systems.machine.opc_ua import OpcUaLink
+from .systems.machine.rehearsal import ServerProcess, served_system
+from .systems.real_system import Actuation, Reading, RealSystem
+from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyReport
 from .evaluation.unseen import RealController
 
 # Trajectories and the twin
-from .steps.config import LearnerConfig, LongTermMemoryConfig
+from .steps.config import LearnerConfig
 from .steps.learn import ActorCritic, Learner, LearningMethod
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
@@ -64,7 +56,6 @@ from .steps.config import (
     HypothesesConfig,
     PlannerConfig,
     RefereeConfig,
-    ShortHorizonConfig,
     TwinningConfig,
 )
 from .steps.hypotheses.ensemble import TwinEnsemble
@@ -77,17 +68,12 @@ from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Star
 from .interruption import require_finished
 from .loading import begin_loading
 from .options import check_options
-from .runs.callbacks import EarlyStopping
-from .runs.command_line import main_of
-from .runs.compare import Comparison, compare_runs
 from .runs.loaded_run import LoadedRun, load_run
-from .runs.machine import require_device
 from .runs.run import Run
-from .runs.run_config import Preset, RunConfig
-from .runs.shipped_plants import shipped_plants
+from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
+from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
-from .systems.fmu_environment import FMUEnvironment, FMUError
 from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
@@ -103,7 +89,6 @@ __all__ = [
     "CallingSimulator",
     "Clairvoyant",
     "ClassicalController",
-    "Comparison",
     "ConnectedPlant",
     "ConstraintsConfig",
     "ContractReport",
@@ -130,13 +115,11 @@ __all__ = [
     "Extension",
     "FMUEnvironment",
     "FMUError",
-    "FaultySystem",
     "FirstController",
     "Forecast",
     "Foreseen",
     "Held",
     "HypothesesConfig",
-    "Injection",
     "LaggedActuator",
     "LaggedCoefficients",
     "Learner",
@@ -147,7 +130,6 @@ __all__ = [
     "LinkLostError",
     "LoadedRun",
     "LogConfig",
-    "LongTermMemoryConfig",
     "Measurement",
     "ModbusLink",
     "Named",
@@ -176,8 +158,8 @@ __all__ = [
     "Referee",
     "RefereeConfig",
     "RefusedRequestError",
+    "Register",
     "ReinforcementTwinning",
-    "Relay",
     "ResonantActuator",
     "Rollout",
     "Run",
@@ -196,7 +178,6 @@ __all__ = [
     "SensorRecord",
     "ServerProcess",
     "ShortHorizon",
-    "ShortHorizonConfig",
     "Signal",
     "SmoothClip",
     "Snapshot",
@@ -214,7 +195,6 @@ __all__ = [
     "check_options",
     "check_plant",
     "clairvoyant",
-    "compare_runs",
     "control_cost",
     "export_c",
     "export_controller",

@@ -36,7 +36,6 @@ from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
@@ -44,7 +43,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.flight import RealFlights, ShortTermMemory
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
+from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, Operating
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
@@ -53,7 +52,7 @@ from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operation import Operation, system_of
+from rt_torchrl.systems.operation.operator import Operation, system_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import batch_of
@@ -139,7 +138,6 @@ class ReinforcementTwinning(TensorDictSequential):
         for role, half in halves.items():
             if half.policy is not policies[role]:
                 raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
-        share_critic(learner, model_based)
         fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
         virtual = VirtualEpisodes(
@@ -147,7 +145,7 @@ class ReinforcementTwinning(TensorDictSequential):
             config.exogenous,
             config.experience,
             constraints=getattr(planner, "constraints", None),
-            extremes=0 if fed_back else config.planner.extremes,
+            extremes=0 if fed_back or config.planner.method == "single_start" else EXTREMES,
             generator=generator,
         )
         corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
@@ -155,7 +153,7 @@ class ReinforcementTwinning(TensorDictSequential):
         actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)
         collector = env if isinstance(env, Operation) else make_collector(env, actor, twin.plant)
         rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
-        flights = RealFlights(env, actor, rollout, twin.plant, config.least_sound)
+        flights = RealFlights(env, actor, rollout, twin.plant)
         clearance = Clearance(system, policies, virtual, config.limits)
         interact = Interact(env, policies, flights, clearance, belief, config, judged)
         assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
@@ -166,7 +164,7 @@ class ReinforcementTwinning(TensorDictSequential):
             "learn": Learn(learner, belief, judged),
             "inputs": FitInputs(virtual),
             "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
-            "plan": MakePlan(planning, count, judged, recorded=config.planner.initial == "record"),
+            "plan": MakePlan(planning, count, judged, recorded=config.planner.method == "single_start"),
             "switch": Switch(referee, policies, belief, imitation, halves, learner.observations, judged),
         }
         super().__init__(OrderedDict((name, steps[name]) for name in ARMS[config.arm]))
@@ -343,19 +341,3 @@ class ReinforcementTwinning(TensorDictSequential):
             return super().load_state_dict(on_device(state, self.generator.device), strict, assign)
         except RuntimeError as error:
             raise ValueError(f"the saved state of policies or closure does not fit: {error}") from error
-
-
-def share_critic(learner: object, policy: nn.Module) -> None:
-    """Give model predictive control the cost-to-go of the model-free half, if it is to price the end of its windows.
-
-    Raises:
-        ValueError: if the learner has no method ``cost_to_go``.
-    """
-    if isinstance(policy, PredictiveControl) and policy.terminal == "critic":
-        cost_to_go = getattr(learner, "cost_to_go", None)
-        if cost_to_go is None:
-            raise ValueError(
-                f"terminal='critic' of the receding horizon needs a learner with a method cost_to_go(observation); "
-                f"{type(learner).__name__} has none. Use terminal plant."
-            )
-        policy.value = cost_to_go

@@ -21,11 +21,10 @@ from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import GREATEST_SPEED, read_wind
 from rt_torchrl.fit.log import SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import INTERVALS_PER_ROW, resample
-from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_settings import as_written
-from rt_torchrl.runs.settings import BESIDE, config_of, read_settings
-from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
+from rt_torchrl.runs.run_folder import load_tensors, save_tensors
+from rt_torchrl.runs.settings import BESIDE, as_written, config_of, read_settings
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -106,7 +105,7 @@ def read_weights(path: Path) -> None:
 
 
 def content() -> dict:
-    return {"format": checkpoint.FORMAT, "episodes": [{"episode": 0}], "state": {"plant": "p", "algorithm": weights()}}
+    return {"format": run_folder.FORMAT, "episodes": [{"episode": 0}], "state": {"plant": "p", "algorithm": weights()}}
 
 
 class Holder:
@@ -120,7 +119,7 @@ class Holder:
 
 
 def read_checkpoint(path: Path) -> None:
-    assert checkpoint.load(path, Holder()) == [{"episode": 0}]
+    assert run_folder.load_checkpoint(path, Holder()) == [{"episode": 0}]
 
 
 def read_config(path: Path) -> None:

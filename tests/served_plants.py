@@ -5,8 +5,7 @@ import contextlib
 import socket
 import threading
 
-from rt_torchrl.systems.protocols.plant_server import BOARDS, serve
-from rt_torchrl.systems.protocols.served_plant import ServedPlant
+from rt_torchrl.systems.machine.rehearsal import SERVERS, ServedPlant, serve
 
 
 def free_port():
@@ -20,8 +19,8 @@ def served(plant, protocol, *, safe, period, seed=0):
     """The plant in operation; gives it and the port that its server listens on."""
     port, ended, started = free_port(), threading.Event(), threading.Event()
     running = ServedPlant(plant, safe, seed=seed)
-    board = BOARDS[protocol](running.tags, port)
-    serving = serve(running, board, period, ended=ended.is_set, begun=started.set)
+    server = SERVERS[protocol](plant, port)
+    serving = serve(running, server, period, ended=ended.is_set, begun=started.set)
     work = threading.Thread(target=lambda: asyncio.run(serving), daemon=True)
     work.start()
     assert started.wait(30.0)

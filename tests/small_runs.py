@@ -4,11 +4,11 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import HypothesesConfig, LearnerConfig, LongTermMemoryConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.config import HypothesesConfig, LearnerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 
 SMALL = TwinningConfig(
-    hypotheses=HypothesesConfig(which="none"),  # a twin that has hardly learned would call for them
+    hypotheses=HypothesesConfig(which=("none",)),  # a twin that has hardly learned would call for them
     realisations=2,
     virtual_episodes=2,
     exploration=ExplorationConfig(episodes=2),
@@ -17,7 +17,7 @@ SMALL = TwinningConfig(
         actor_iterations=3,
         batch_size=8,
         critic_hidden=(8,),
-        memory=LongTermMemoryConfig(capacity=500),
+        memory_capacity=500,
     ),
     # No patience, so that swaps and clones happen within the few episodes of a test.
     referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),

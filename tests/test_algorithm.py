@@ -14,7 +14,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
-from rt_torchrl.steps.flight import ShortTermMemory
 from rt_torchrl.steps.report import plain
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
@@ -31,7 +30,7 @@ def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
             "realisations": 2,
             "virtual_episodes": 3,
             "learner": LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
-            "assimilation": AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+            "assimilation": AssimilationConfig(iterations=2),
             "planner": PlannerConfig(iterations=2, starts=0, descent=DescentConfig(rate=0.01)),
             **options,
         }
@@ -229,7 +228,7 @@ def test_identification_finds_the_true_closure():
     found = twinning(
         plant,
         arm="model_based",
-        assimilation=AssimilationConfig(iterations=80, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+        assimilation=AssimilationConfig(iterations=80, method="lbfgs"),
         exploration=ExplorationConfig(spread=0.5, episodes=5),
     )
     report = flown(found, "interact", "inputs", "assimilate")
@@ -319,12 +318,3 @@ def test_an_arm_is_a_shorter_sequence():
     found = twinning()
     arm = found.select_subsequence(out_keys=[("weight_changes", "model_free")])
     assert list(arm.module) == STEPS[:2]
-
-
-def test_short_term_memory_keeps_the_last_episodes_in_order():
-    memory = ShortTermMemory(2)
-    for record in "abc":
-        memory.append(record)
-    assert list(memory) == ["b", "c"]
-    with pytest.raises(ValueError, match="capacity=0"):
-        ShortTermMemory(0)

@@ -15,7 +15,7 @@ from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveCo
 from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import BiasedSensor
-from rt_torchrl.runs.results_table import hypothesis_lines, results_table
+from rt_torchrl.runs.results import hypothesis_lines, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, extended
@@ -40,7 +40,7 @@ def run(tmp_path_factory):
     """A training of one episode, in which the right hypothesis takes over."""
     folder = tmp_path_factory.mktemp("believed")
     assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
-    hypotheses = HypothesesConfig(call=0.0, names=("lags",))
+    hypotheses = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
     options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
     config = Config(episodes=1, log_dir=folder, twinning=twinning, **options)

@@ -14,14 +14,11 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_settings import as_written
-from rt_torchrl.runs.settings import config_of
+from rt_torchrl.runs.settings import as_written, config_of
 from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operating_limits import OperatingLimits
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
-from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
+from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})

@@ -12,7 +12,7 @@ from printed_commands import ROOT, TEXTS, commands, options, spans
 
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
@@ -23,7 +23,9 @@ BUILD = "uv run --group docs sphinx-build -W --keep-going docs docs/_build"
 
 def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
-    if name in ("export", "in_service"):
+    if name == "unknown":
+        return ["flapping_wing", *arguments]
+    if name in ("compare", "export"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -38,7 +40,7 @@ NO_OPTIONS = ROOT / "tests" / "no_options.json"
 @pytest.fixture(autouse=True)
 def _with_every_logger(monkeypatch):
     """As if the packages that the documentation tells to install were there."""
-    monkeypatch.setattr("rt_torchrl.runs.loggers.PACKAGES", {})
+    monkeypatch.setattr("rt_torchrl.runs.run_config.PACKAGES", {})
 
 
 def refusal(name, arguments):
@@ -117,8 +119,9 @@ def test_checks_that_are_printed_are_what_ci_runs():
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
-    known |= {"uv run quadrotor.py", "uv run heated_room.py"}  # tests/test_documentation.py
-    known |= {"uv run tests/ruler.py"}  # tests/test_results.py
+    known |= {"uv run docs/quadrotor.py", "uv run docs/heated_room.py"}  # tests/test_documentation.py
+    known |= {"uv run tests/ruler.py"}  # tests/test_study.py
+    known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
     known |= {f"{PYTEST} -m faults", "uv run --group test --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
     assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
@@ -182,6 +185,6 @@ def direct_of(extra, extras):
 
 def test_one_word_for_the_folder_of_the_results():
     """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "export", "paper", "record_log"}
+    without = {"benchmark", "compare", "export", "paper", "record_log"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

@@ -16,7 +16,7 @@ from printed_commands import ROOT, commands
 from test_pendulum import require_quiet
 
 from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 
 pytestmark = pytest.mark.slow
 TRAININGS = [
@@ -176,7 +176,9 @@ def test_the_hooks_are_installed(clone):
     assert (clone / ".git" / "hooks" / "pre-commit").exists()
 
 
-@pytest.mark.parametrize("command", [command for command in commands() if "recipes/study.py" in command])
+@pytest.mark.parametrize(
+    "command", [command for command in commands() if re.search(r"recipes/(study|unknown).py", command)]
+)
 def test_a_printed_study_begins(command, clone, monkeypatch):
     """Up to its plan of tasks; the tests of the study run some."""
-    require_begun_here(command, clone, monkeypatch, "compare_runs" if "--runs" in command else "run_all")
+    require_begun_here(command, clone, monkeypatch, "side_by_side" if "study.py" in command else "on_this_machine")

@@ -77,10 +77,9 @@ def test_roles_exchange_and_only_by_a_swap(live, other):
     assert (referee.live, referee.idle) == (live, other)
 
 
-@pytest.mark.parametrize("live_cost, event", [(1.49, "keep"), (1.5, "keep"), (1.51, "swap")])
-def test_tolerance_is_a_factor_on_the_idle_cost(live_cost, event):
-    config = RefereeConfig(patience=0, tolerance=1.5)
-    assert DecisionTree(config).decide(evidence(live_cost, 1.0, MOVING)) == event
+@pytest.mark.parametrize("live_cost, event", [(0.99, "keep"), (1.0, "keep"), (1.01, "swap")])
+def test_the_live_policy_is_worse_where_it_costs_more(live_cost, event):
+    assert DecisionTree(RefereeConfig(patience=0)).decide(evidence(live_cost, 1.0, MOVING)) == event
 
 
 @pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "idle_weight_change"])))

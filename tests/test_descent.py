@@ -139,7 +139,7 @@ def test_adam_keeps_its_moments_between_runs_and_restart_forgets_them():
     config = DescentConfig(rate=0.1, gradient_limit=100.0)
     point, by_hand = Point(), Point()
     descent = Descent(point, config)
-    adam = torch.optim.Adam(by_hand.parameters(), lr=0.1, betas=(0.9, config.second_moment))
+    adam = torch.optim.Adam(by_hand.parameters(), lr=0.1, betas=(0.9, 0.9))
     for _ in range(2):
         descent.run(Bowl(point), 1)
         start = Bowl(by_hand)().item()

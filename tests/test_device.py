@@ -19,8 +19,8 @@ from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
-from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, ShortHorizonConfig
+from rt_torchrl.runs.run_folder import load_tensors, save_tensors
+from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
 
 
 class _Backend(_DummyBackendModule):
@@ -235,7 +235,7 @@ ONE_OF_EACH = dataclasses.replace(
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
 )
-WINDOWS = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=3, critic_iterations=1))
+WINDOWS = PlannerConfig(method="short_horizon", window=3, iterations=1)
 NEURAL = {"closure": "mlp", "closure_hidden": (4,), "model_free_policy": "mlp", "hidden": (4,)}
 TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
 

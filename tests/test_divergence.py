@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, RefereeConfig
 from rt_torchrl.steps.report import EpisodeReport, findings
@@ -154,7 +153,7 @@ def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch
 
 
 METHODS = [
-    AssimilationConfig(iterations=2, segment=0, descent=DescentConfig(rate=0.01)),
+    AssimilationConfig(iterations=2, segment=0),
     AssimilationConfig(iterations=2, segment=0, method="levenberg_marquardt"),
 ]
 

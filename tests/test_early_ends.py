@@ -8,6 +8,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from small_runs import SMALL
 from test_algorithm import flown
+from test_learn import values
 from test_real_system import MILLIMETRES, Rig, connected
 
 from rt_torchrl import (
@@ -17,7 +18,6 @@ from rt_torchrl import (
     ReinforcementTwinning,
     Scenario,
     ShortHorizon,
-    ShortHorizonConfig,
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
@@ -26,7 +26,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.operated import operation_of
+from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig
@@ -171,16 +171,16 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
         assert found["next", "reward"][k].item() == pytest.approx(summed, rel=1e-9)
         assert found["next", "terminated"][k].item() == ends
         if ends:  # nothing is bootstrapped
-            q = learner.values(found["observation"][k : k + 1], found["action"][k : k + 1]).item()
+            q = values(learner, found["observation"][k : k + 1], found["action"][k : k + 1]).item()
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
 
 
 def test_windows_count_what_an_end_costs(monkeypatch):
     plant = Falling()
     monkeypatch.setattr(ShortHorizon, "mixing", 0.7)
-    short = ShortHorizonConfig(window=5, discount=0.9)
+    monkeypatch.setattr(ShortHorizon, "discount", 0.9)
     generator = torch.Generator().manual_seed(1)
-    planning = PlannerConfig(short_horizon=short)
+    planning = PlannerConfig(method="short_horizon", window=5)
     plan = ShortHorizon(DigitalTwin(plant, plant.closure), LinearGain(WEAK), planning, generator=generator)
     plan.reference = 4.0
     costs, seen = torch.rand(2, 5, generator=generator).double(), torch.rand(2, 6, 2, generator=generator).double()
@@ -196,10 +196,10 @@ def test_windows_count_what_an_end_costs(monkeypatch):
     torch.testing.assert_close(found[1, 1], before.detach())
 
 
-def test_plans_over_short_windows_keep_a_rod_that_would_fall():
+def test_plans_over_short_windows_keep_a_rod_that_would_fall(monkeypatch):
+    monkeypatch.setattr(ShortHorizon, "policy_rate", 2e-2)
     plant = Falling()
-    short = ShortHorizonConfig(window=10, policy_rate=2e-2)
-    planning = PlannerConfig(short_horizon=short, iterations=6)
+    planning = PlannerConfig(method="short_horizon", window=10, iterations=6)
     policy = LinearGain(WEAK)
     plan = ShortHorizon(DigitalTwin(plant, plant.closure), policy, planning, generator=torch.Generator().manual_seed(1))
     start = plan.plan(Scenario(*drawn(plant, 16))).start

@@ -195,7 +195,7 @@ def test_what_cannot_be_estimated_is_refused():
 
 
 def test_the_example_of_the_documentation_runs():
-    (code,) = blocks("partial_measurements.md", "python")
+    (code,) = blocks("identify.md", "python")
     names = {}
     exec(code, names)
     found, plant = names["found"], names["plant"]

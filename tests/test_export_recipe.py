@@ -12,10 +12,9 @@ from test_run import SMALL
 
 from rt_torchrl import load_run
 from rt_torchrl.export import c_compiler
-from rt_torchrl.runs.configured_plant import physics_of
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import RunConfig, physics_of
 from rt_torchrl.runs.settings import config_of, settings_of
 
 RECIPES = Path(__file__).parent.parent / "recipes"

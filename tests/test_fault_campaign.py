@@ -21,6 +21,7 @@ import pytest
 import torch
 from fault_counts import count
 from fault_victim import EPISODES, QUICK, SHIPPED, victim
+from faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from tensordict.nn import TensorDictModule
@@ -30,15 +31,13 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.runs import checkpoint
-from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
+from rt_torchrl.runs import run_folder
+from rt_torchrl.runs.run_folder import load_tensors, save_tensors
+from rt_torchrl.systems.config import OperationConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
-from rt_torchrl.systems.operation.acting import Crew
-from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.operation.operator import Crew
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -220,7 +219,7 @@ def broken(whole, number, trace):
     if kind == "foreign pickle":
         if number % 4:
             return kind, pickle.dumps({"format": Bomb(trace)})
-        torch.save({"format": checkpoint.FORMAT, "episodes": [], "state": Bomb(trace)}, trace.with_suffix(".pt"))
+        torch.save({"format": run_folder.FORMAT, "episodes": [], "state": Bomb(trace)}, trace.with_suffix(".pt"))
         return kind, trace.with_suffix(".pt").read_bytes()
     if kind == "foreign tensors":
         save_tensors(trace.with_suffix(".pt"), {"weights": torch.zeros(3)})
@@ -249,7 +248,7 @@ def kept(tmp_path_factory):
     """A run of which three checkpoints are kept, with the states in them."""
     folder = tmp_path_factory.mktemp("kept")
     small_run(folder, episodes=EPISODES, **QUICK).train()
-    files = [folder / "checkpoint.pt", *checkpoint.earlier(folder / "checkpoint.pt")]
+    files = [folder / "checkpoint.pt", *run_folder.earlier(folder / "checkpoint.pt")]
     assert [file.name for file in files] == ["checkpoint.pt", "checkpoint-0004.pt", "checkpoint-0003.pt"]
     return files, [load_tensors(file)["state"]["algorithm"] for file in files]
 
@@ -269,7 +268,7 @@ def require_fallen_back(kept, number, folder, algorithm, capsys):
     what = f"checkpoint: {kind}"
     capsys.readouterr()
     try:
-        episodes = checkpoint.load(path, algorithm)
+        episodes = run_folder.load_checkpoint(path, algorithm)
     except ValueError as error:
         said = str(error)
         assert alone and "checkpoint.pt" in said and "--overwrite" in said
@@ -288,7 +287,7 @@ def require_fallen_back(kept, number, folder, algorithm, capsys):
 
 
 def plain(state):
-    from rt_torchrl.runs.tensor_file import plain as of
+    from rt_torchrl.runs.run_folder import plain as of
 
     return of(state)
 

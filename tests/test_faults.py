@@ -4,20 +4,18 @@ import json
 
 import pytest
 import torch
+from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
-from printed_commands import blocks
 from small_runs import SMALL
-from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.faulty_system import FaultySystem, Injection
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 
 DT, N = 0.1, 40
 WATCHED = {
@@ -199,19 +197,3 @@ def algorithm_of(run, system):
 def test_injections_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         guarded(Injection(**options))
-
-
-@pytest.mark.slow
-def test_the_example_of_the_documentation_flies():
-    """As printed; then four episodes whose actions are constant."""
-    (code,) = blocks("faults.md", "python")
-    names = {}
-    exec(code, names)
-    layer = names["layer"]
-    flown, steady = [], TensorDictModule(lambda seen: torch.ones(1, 2).double(), ["observation"], ["action"])
-    for _ in range(3):
-        flown.append(layer.rollout(layer.plant.n_steps, steady))
-    assert layer.reports[1].counts["not finite"] == 5 and flown[1]["next", "refused"].sum() == 5
-    assert {kind for _, _, kind in layer.injected} == {"nan", "stuck_actuator"}
-    with pytest.raises(ConnectionError, match="injected"):
-        layer.rollout(layer.plant.n_steps)

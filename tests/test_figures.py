@@ -27,8 +27,7 @@ from rt_torchrl.figures.policy import RESOLUTION, visited_observations
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs.results import episode_record, results
-from rt_torchrl.runs.results_table import merit_lines
+from rt_torchrl.runs.results import episode_record, merit_lines, results
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout

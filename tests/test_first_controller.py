@@ -26,7 +26,7 @@ def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
     descent = DescentConfig(optimiser="lbfgs", rate=1.0)
     planner = PlannerConfig(iterations=iterations, descent=descent)
-    assimilation = AssimilationConfig(iterations=3, descent=DescentConfig(rate=0.02))
+    assimilation = AssimilationConfig(iterations=3)
     parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
     return ReinforcementTwinning(
         PlantEnv(plant, seed=0),

@@ -15,9 +15,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.fmu import export_policy_fmu, export_twin_fmu
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run import Run
-from rt_torchrl.systems.fmu_environment import FMUEnvironment, FMUError
-from rt_torchrl.systems.reading import Reading
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.adapters import FMUEnvironment, FMUError
+from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.trajectories.rollout import Rollout
 
 fmpy = pytest.importorskip("fmpy")
@@ -158,6 +157,42 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
     made.close()
 
 
+class Stubborn:
+    """An FMU that refuses every step, and to terminate after that."""
+
+    def __init__(self):
+        self.freed = False
+
+    def refuse(self, **given):
+        raise RuntimeError("fmi2Error")
+
+    doStep = terminate = refuse
+    setupExperiment = enterInitializationMode = exitInitializationMode = setReal = lambda self, *given, **times: None
+
+    def getReal(self, places):
+        return [0.0] * len(places)
+
+    def freeInstance(self):
+        self.freed = True
+
+
+@needs_compiler
+def test_an_fmu_that_refuses_to_terminate_is_freed_and_its_folder_removed(turbine, monkeypatch):
+    instances = []
+    monkeypatch.setattr(
+        fmpy.simulation, "instantiate_fmu", lambda *given: instances.append(Stubborn()) or instances[-1]
+    )
+    made = environment(turbine)
+    for _ in range(2):
+        entries = made.reset()
+        with pytest.raises(FMUError, match="refuses to doStep at t = 0 s: fmi2Error"):
+            made.step(entries.set("action", torch.tensor([1e4, 0.0]).double()))
+    folder = Path(made._folder)
+    assert instances[0].freed and folder.is_dir()
+    made.close()
+    assert instances[1].freed and not folder.exists()
+
+
 @needs_compiler
 def test_what_does_not_fit_an_fmu_is_refused(turbine, tmp_path):
     (tmp_path / "no.fmu").write_text("nothing")
@@ -215,14 +250,7 @@ class PlantInPlace:
     enterInitializationMode = exitInitializationMode = terminate = freeInstance = lambda self: None
 
 
-class InPlace(FMUEnvironment):
-    """The same environment, in which no machine code of the FMU runs."""
-
-    def _instantiated(self):
-        return PlantInPlace(self.plant)
-
-
-def trained(folder, path, kind):
+def trained(folder, path):
     """The results of a short training with all six steps."""
     from pathlib import Path
 
@@ -235,7 +263,7 @@ def trained(folder, path, kind):
         return dict(zip(names, plant.draw_initial_state(1, generator)[0].tolist(), strict=True))
 
     given = {"actions": [f"command.{s.name}" for s in plant.actions], "outputs": names}
-    system = kind(path, plant, **given, exogenous=["exogenous.wind_speed"], start=start, seed=5)
+    system = FMUEnvironment(path, plant, **given, exogenous=["exogenous.wind_speed"], start=start, seed=5)
     real = RealSystem(
         system, plant, state=Reading(keys=("outputs",)), exogenous=Reading(keys=("exogenous",)), closure=plant.closure
     )
@@ -246,14 +274,15 @@ def trained(folder, path, kind):
 
 @needs_compiler
 @pytest.mark.nightly
-def test_a_training_on_an_fmu_is_one_on_the_plant(tmp_path):
+def test_a_training_on_an_fmu_is_one_on_the_plant(tmp_path, monkeypatch):
     """Rounding of the C code is all that parts them; every episode of learning lets it grow."""
     plant = WindTurbine(horizon=60.0, observe=("measured+wind",))
     export_twin_fmu(plant.closure, tmp_path / "turbine.fmu", plant)
     assert environment(tmp_path / "turbine.fmu")
-    found, expected = (
-        trained(tmp_path / kind.__name__, tmp_path / "turbine.fmu", kind) for kind in (FMUEnvironment, InPlace)
-    )
+    found = trained(tmp_path / "fmu", tmp_path / "turbine.fmu")
+    # The same, in which no machine code of the FMU runs.
+    monkeypatch.setattr(fmpy.simulation, "instantiate_fmu", lambda *given: PlantInPlace(plant))
+    expected = trained(tmp_path / "in place", tmp_path / "turbine.fmu")
     pairs = zip(found["episodes"], expected["episodes"], strict=True)
     for one, other in pairs:
         assert one["real_cost"] == pytest.approx(other["real_cost"], rel=1e-6)

@@ -13,8 +13,7 @@ from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.runs.results import hypotheses_of, twin_entries
-from rt_torchrl.runs.results_table import hypothesis_lines, progress
+from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, progress, twin_entries
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.assimilate import Assimilation
@@ -405,21 +404,21 @@ def counters(assimilation):
 
 
 def test_hypotheses_are_chosen_by_name():
-    twin, _ = ensemble(PLANT, names=("late",))
+    twin, _ = ensemble(PLANT, which=("late",))
     assert list(twin.twins) == [ALONE, "late"]
-    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which="none"))) is DigitalTwin
+    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which=("none",)))) is DigitalTwin
     assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is DigitalTwin
 
 
-@pytest.mark.parametrize("which", ["none", "automatic"])
+@pytest.mark.parametrize("which", ["none", "late"])
 def test_options_are_those_of_the_algorithm(which, tmp_path):
     """They reach the twin and its step 4 through a run."""
-    hypotheses = HypothesesConfig(which=which, call=0.02, names=("late",) if which == "automatic" else ())
+    hypotheses = HypothesesConfig(which=(which,), call=0.02)
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses)
     options = {"compiled": False, "unseen": 2, "figures": False, "twinning": twinning}
     algorithm = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=2.0)).algorithm
-    assert isinstance(algorithm.twin, TwinEnsemble) == (which == "automatic")
-    if which == "automatic":
+    assert isinstance(algorithm.twin, TwinEnsemble) == (which == "late")
+    if which == "late":
         assert list(algorithm.twin.twins) == [ALONE, "late"]
         assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called
 
@@ -431,7 +430,7 @@ def test_a_run_shows_the_twin_that_is_believed(tmp_path, capsys):
 
     known = Suspecting(horizon=4.0)
     twinning = dataclasses.replace(
-        SMALL, arm="model_based", assimilation=ASSIMILATION, hypotheses=HypothesesConfig(call=0.0, names=("lags",))
+        SMALL, arm="model_based", assimilation=ASSIMILATION, hypotheses=HypothesesConfig(call=0.0, which=("lags",))
     )
     options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
     run = Run(RunConfig(log_dir=tmp_path, **options), LaggedActuator(known, "force", LAG), believed=known)

@@ -16,7 +16,7 @@ from torch.utils._pytree import tree_flatten
 from torchrl.objectives import DDPGLoss
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, Iteration, LearningMethod, LongTermMemory
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -76,9 +76,26 @@ def scaled(data):
 
 def filled(data, found, seed=1, **options):
     """The learner's memory with these transitions alone."""
-    found.memory = LongTermMemory(LongTermMemoryConfig(capacity=len(data), **options), generator=seeded(seed))
+    found.memory = LongTermMemory(len(data), generator=seeded(seed), **options)
     found.memory.store(scaled(data), found.td_errors(scaled(data)))
     return found.memory
+
+
+def values(found, observation, action, *, target=False):
+    """The values of all critics of a learner, or of their targets, for scaled actions."""
+    pairs = TensorDict({"observation": observation, "action": action}, batch_size=len(observation))
+    name = "qvalue_network" if hasattr(found.loss, "qvalue_network_params") else "value_network"
+    network, weights = getattr(found.loss, name), getattr(found.loss, f"{'target_' * target}{name}_params")
+    of_each = list[torch.Tensor]()
+    for of_one in weights.unbind(0) if weights.batch_size else [weights]:
+        with of_one.to_module(network):
+            of_each.append(network(pairs.copy())["state_action_value"])
+    return torch.stack(of_each)
+
+
+def cost_to_go(found, observation):
+    """−q(e, π(e)) of the lowest value."""
+    return -values(found, observation, found.policy(observation) / HALF_RANGE).amin(0).squeeze(-1)
 
 
 def assert_equal(state, other):
@@ -198,7 +215,7 @@ def test_a_relaxed_critic_takes_a_share_of_its_step_and_is_its_own_target():
         steps.append(torch.cat([w.detach().flatten() for w in one.critic_adam.weights]) - before)
         assert one.target is None
         observation, action = torch.ones(3, 2, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)
-        assert torch.equal(one.values(observation, action), one.values(observation, action, target=True))
+        assert torch.equal(values(one, observation, action), values(one, observation, action, target=True))
     assert steps[1].abs().max() > 5e-4  # Adam's first step is its rate
     torch.testing.assert_close(steps[0], 0.25 * steps[1], rtol=1e-9, atol=1e-15)
 
@@ -222,11 +239,11 @@ def test_the_actor_climbs_the_value_of_its_actions():
         for k in range(2):
             for sign in (1.0, -1.0):
                 found.policy.gain[0, k] += sign * h
-                slope[0, k] += sign * found.cost_to_go(data["observation"]).mean() / (2 * h)
+                slope[0, k] += sign * cost_to_go(found, data["observation"]).mean() / (2 * h)
                 found.policy.gain[0, k] -= sign * h
     keys = [key for key in BATCH if key in scaled(data).keys(include_nested=True)]
     value, norm = Iteration(found, "actor", keys).eager(*(scaled(data)[key] for key in keys))
-    assert value.item() == pytest.approx(-found.cost_to_go(data["observation"]).mean().item(), rel=0.1)
+    assert value.item() == pytest.approx(-cost_to_go(found, data["observation"]).mean().item(), rel=0.1)
     assert norm.item() == pytest.approx(slope.norm().item(), rel=1e-6)
     assert torch.equal(found.actor_adam.moments[0][0].sign(), slope.sign())
 
@@ -304,11 +321,11 @@ def test_td_error_is_that_of_the_target_critic_and_bootstraps_through_truncation
     first["next", "done"].fill_(done)
     following = first["next", "observation"]
     with torch.no_grad():
-        ahead = found.values(following, found.policy(following) / HALF_RANGE, target=True)[0]
+        ahead = values(found, following, found.policy(following) / HALF_RANGE, target=True)[0]
         expected = (
-            first["next", "reward"] + GAMMA_IN_TORCHRL * ahead - found.values(first["observation"], first["action"])[0]
+            first["next", "reward"] + GAMMA_IN_TORCHRL * ahead - values(found, first["observation"], first["action"])[0]
         ).abs()[:, 0]
-        assert not torch.equal(ahead, found.values(following, found.policy(following) / HALF_RANGE)[0])
+        assert not torch.equal(ahead, values(found, following, found.policy(following) / HALF_RANGE)[0])
     torch.testing.assert_close(found.td_errors(first), expected, rtol=1e-10, atol=1e-12)  # |δ| = √δ²
 
 
@@ -383,8 +400,8 @@ def test_the_lower_of_two_targets_at_the_delayed_policys_smoothed_action():
     noise = (0.2 * torch.randn_like(first["action"])).clamp(-0.5, 0.5)
     with torch.no_grad():
         action = (LinearGain(gain)(following) / HALF_RANGE + noise).clamp(-1.0, 1.0)
-        y = reward + GAMMA_IN_TORCHRL * found.values(following, action, target=True).amin(0)
-        expected = (y - found.values(first["observation"], first["action"])).abs().amax(0)[:, 0]
+        y = reward + GAMMA_IN_TORCHRL * values(found, following, action, target=True).amin(0)
+        expected = (y - values(found, first["observation"], first["action"])).abs().amax(0)[:, 0]
     torch.testing.assert_close(errors, expected, rtol=1e-10, atol=1e-12)
 
 
@@ -402,8 +419,7 @@ def test_all_is_drawn_from_the_learners_generator(algorithm):
 
 def test_the_critics_start_apart():
     data = scaled(explored(4))
-    values = learner("td3").values(data["observation"], data["action"])
-    assert not torch.equal(values[0], values[1])
+    assert not torch.equal(*values(learner("td3"), data["observation"], data["action"]))
 
 
 @pytest.mark.parametrize(
@@ -483,17 +499,16 @@ def test_the_target_discounts_by_the_steps_it_has_summed():
     found = model_free.transitions(episode(4))
     with torch.no_grad():
         action = model_free.policy(found["next", "observation"]) / HALF_RANGE
-        bootstrap = model_free.values(found["next", "observation"], action)[0]  # the target critic starts as its copy
+        bootstrap = values(model_free, found["next", "observation"], action)[0]  # the target critic starts as its copy
         discount = 0.5**3
         y = found["next", "reward"] + discount * bootstrap
-        delta = y - model_free.values(found["observation"], found["action"])[0]
+        delta = y - values(model_free, found["observation"], found["action"])[0]
     # TorchRL keeps γ in single precision.
     torch.testing.assert_close(model_free.td_errors(found), delta.abs().squeeze(-1), rtol=1e-6, atol=1e-7)
 
 
 def memory(capacity=10, seed=0, **options):
-    config = LongTermMemoryConfig(capacity=capacity, **options)
-    return LongTermMemory(config, generator=torch.Generator().manual_seed(seed))
+    return LongTermMemory(capacity, generator=torch.Generator().manual_seed(seed), **options)
 
 
 def labelled(labels):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fault_counts import count
+from faulty_system import FaultySystem, Injection
 from hypothesis import HealthCheck, given, settings
 from linear_quadratic import LinearQuadratic
 from malformed_files import GOOD, READERS, damaged, outcome
@@ -39,12 +40,8 @@ from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.fit.log import Column, SensorLog
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.action_limits import ActionLimits
-from rt_torchrl.systems.faulty_system import FaultySystem, Injection
-from rt_torchrl.systems.operating_limits import OperatingLimits
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
-from rt_torchrl.systems.protocols.link import require_timeout
-from rt_torchrl.systems.watchdog import Watchdog
+from rt_torchrl.systems.config import OperatingLimitsConfig
+from rt_torchrl.systems.safety import ActionLimits, OperatingLimits
 
 NUMBERS = (math.nan, math.inf, -math.inf, -1, 0, -1e308, 1e308, 2.5)
 OTHERS = ("x", "", None, [], {}, True, (1.0, 2.0, 3.0), object())
@@ -114,8 +111,11 @@ CONSTRUCTORS = [
     (Reading, {"scale": 1.0, "offset": 0.0}),
     (Actuation, {"scale": 1.0, "offset": 0.0}),
     (lambda **o: Signal(symbol="x", name="x", unit="m", **o), {"low": -1.0, "high": 1.0}),
-    (lambda **o: Watchdog({}, **o), {"deadline": 1.0, "hold": 1.0, "patience": 1.0}),
-    (lambda **o: ActionLimits(SPEC, **o), {"interval": 0.1, "low": (-1.0,), "high": (1.0,), "rates": (1.0,)}),
+    (lambda **o: SafetyConfig(interval=0.1, **o), {"deadline": 1.0, "hold": 1.0, "patience": 1.0}),
+    (
+        lambda **o: ActionLimits(SPEC, SafetyConfig(**o)),
+        {"interval": 0.1, "low": (-1.0,), "high": (1.0,), "rates": (1.0,)},
+    ),
     (SensorLog, STATES),
     (PowerCoefficientTable, TABLE),
     (lambda **o: WindRecord(source="test", **o), {"time": np.arange(5.0), "speed": np.full(5, 8.0)}),
@@ -302,7 +302,11 @@ WRONG = {
         "interval=100.0 s must be the control interval",
         "1 ms is 0.001 s",
     ),
-    "timeout in ms": (lambda: require_timeout(400.0), "timeout=400 s of the link", "1 ms is 0.001 s"),
+    "timeout in ms": (
+        lambda: rt_torchrl.OpcUaLink(None, {}, {}, timeout=400.0),
+        "timeout=400 s of the link",
+        "1 ms is 0.001 s",
+    ),
 }
 
 

@@ -219,7 +219,7 @@ def records(real, noise, count=3):
 
 
 def learned(real, names, noise=0.0):
-    plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, names=names)
+    plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, which=names)
     twin = make_twin(plant, LinearClosure([[0.0, 0.0], [0.0, 0.0]]), config)
     assimilation = make_assimilation(twin, ASSIMILATION, config)
     assimilation.update(list(records(real, noise)), (), 1, torch.Generator())
@@ -310,7 +310,7 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
     plant = plant()
     closure = plant.make_closure(torch.Generator().manual_seed(0))
     assert name not in make_twin(plant, closure, HypothesesConfig()).twins
-    twin = make_twin(plant, closure, HypothesesConfig(names=(name,))).twins[name]
+    twin = make_twin(plant, closure, HypothesesConfig(which=(name,))).twins[name]
     generator = torch.Generator().manual_seed(1)
     state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
     low, high = (torch.tensor([getattr(a, end) for a in plant.actions]).double() for end in ("low", "high"))
@@ -324,4 +324,4 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
 
 def test_names_with_commas_are_quoted():
     with pytest.raises(ValueError, match=r"choose among 'lags', 'late, twice', 'position sensor', 'unknown force'"):
-        make_twin(Suspecting(), LinearClosure([[0.0, 0.0], [0.0, 0.0]]), HypothesesConfig(names=("inflow",)))
+        make_twin(Suspecting(), LinearClosure([[0.0, 0.0], [0.0, 0.0]]), HypothesesConfig(which=("inflow",)))

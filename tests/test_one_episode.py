@@ -58,22 +58,9 @@ def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch)
     calls = counted(monkeypatch, torchdiffeq, "odeint_adjoint")
     trained(tmp_path / "native", seconds=10)
     assert not calls
-    few = (
-        "--twinning.planner.iterations",
-        "1",
-        "--twinning.planner.realisations",
-        "1",
-        "--twinning.planner.starts",
-        "0",
-    )
-    few += (
-        "--twinning.assimilation.iterations",
-        "1",
-        "--twinning.virtual-episodes",
-        "1",
-        "--twinning.planner.extremes",
-        "0",
-    )
+    few = ("--twinning.planner.method", "single_start", "--twinning.planner.iterations", "1")
+    few += ("--twinning.planner.realisations", "1", "--twinning.assimilation.iterations", "1")
+    few += ("--twinning.virtual-episodes", "1")
     trained(tmp_path / "continuous", "--engine", "odeint_adjoint", "--compiled", "False", *few, seconds=6)
     assert len(calls) > 8  # one for every control interval
 

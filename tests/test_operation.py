@@ -7,29 +7,25 @@ import os
 
 import pytest
 import torch
+from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.operated import learner_threads
+from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
+from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.faulty_system import FaultySystem, Injection
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
-from rt_torchrl.systems.operation.acting import Crew
-from rt_torchrl.systems.operation.config import OperationConfig
-from rt_torchrl.systems.operation.event_log import EventLog
+from rt_torchrl.systems.operation.operator import Crew
 from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
-from rt_torchrl.systems.reading import Reading
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -47,7 +43,7 @@ def small(exploration):
         virtual_episodes=3,
         exploration=exploration,
         learner=LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
-        assimilation=AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+        assimilation=AssimilationConfig(iterations=2),
         planner=PlannerConfig(iterations=2, descent=DescentConfig(rate=0.01)),
     )
 
@@ -101,12 +97,13 @@ def test_a_run_on_the_simulated_clock_repeats_to_the_bit(learning, windows):
     assert max(report["windows"].item() for report in reports) == windows
 
 
-def test_the_log_says_when_each_version_began_to_act(tmp_path):
-    log = EventLog(tmp_path / "events.jsonl")
+def test_the_log_says_which_versions_acted_in_each_window(tmp_path):
+    log = tmp_path / "events.jsonl"
     trained(operation_of(log, 7), episodes=3)
-    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
-    taken = [event["flown"] for event in events if event["event"] == "taken"]
-    assert taken == [[[0, 0]], [[20, 0], [27, 1]], [[40, 1], [47, 2]]]
+    events = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [(event.get("version"), event.get("versions")) for event in events] == [
+        *[(0, None), (None, [0]), (1, None), (None, [0, 1]), (2, None), (None, [1, 2]), (3, None)]
+    ]
 
 
 @pytest.mark.parametrize("continuous", [False, True])
@@ -193,7 +190,6 @@ def test_integrators_of_the_plant_carry_over():
         ("speed", 0.0),
         ("speed", math.inf),
         ("handover", 0),
-        ("core", -3),
     ],
 )
 def test_impossible_options_are_refused(option, value):
@@ -337,16 +333,6 @@ def test_model_predictive_control_acts_while_the_twin_learns_and_goes_on_after_a
         assert {k: v for k, v in one.items() if k not in times} == {k: v for k, v in other.items() if k not in times}
 
 
-def test_model_predictive_control_that_asks_a_critic_is_refused(tmp_path):
-    from test_predictive_training import PLANNER
-
-    planner = dataclasses.replace(
-        PLANNER, receding_horizon=dataclasses.replace(PLANNER.receding_horizon, terminal="critic")
-    )
-    with pytest.raises(ValueError, match=r"receding_horizon.terminal='critic' does not go with asynchronous"):
-        operated(tmp_path, twinning=dataclasses.replace(SMALL, planner=planner))
-
-
 # An operation in a process of its own, with true clocks, and whole runs of it.
 
 
@@ -372,23 +358,21 @@ def simulation():
 
 def operation(make_env=simulation, **options):
     policies = {"one": Constant(0.5), "two": Constant(-0.5)}
-    config = OperationConfig(clock="wall", speed=10.0, core=-2, **options)
+    config = OperationConfig(clock="wall", speed=10.0, **options)
     return ProcessOperation(Crew(make_env, SHORT, policies, QUIET, config, seed=1), make_env()), policies
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not let a process choose cores")
 @pytest.mark.parametrize(
     "options, expected",
     [
         ({}, 0),
         ({"asynchronous": True}, 0),
         ({"asynchronous": True, "operation": OperationConfig(clock="wall")}, 2),
-        ({"asynchronous": True, "operation": OperationConfig(clock="wall", core=-2)}, 0),
         ({"asynchronous": True, "operation": OperationConfig(clock="wall"), "threads": 7}, 7),
     ],
 )
-def test_the_learner_has_a_thread_for_each_core_that_is_left(options, expected, monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 6})
+def test_the_learner_leaves_a_core_to_what_acts(options, expected, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     assert learner_threads(RunConfig(**options)) == expected
 
@@ -428,7 +412,7 @@ def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_
 
 @pytest.mark.slow
 def test_a_run_on_the_wall_clock_goes_on_after_a_stop(tmp_path):
-    wall = {"asynchronous": True, "operation": OperationConfig(clock="wall", speed=20.0, core=-2), "threads": 1}
+    wall = {"asynchronous": True, "operation": OperationConfig(clock="wall", speed=20.0), "threads": 1}
     small_run(tmp_path, episodes=2, **wall).train()
     found = small_run(tmp_path, resume=True, **wall).train()
     assert len(found["episodes"]) > 2 and "resumed" in (tmp_path / "events.jsonl").read_text()
@@ -439,13 +423,6 @@ def test_what_cannot_be_sent_is_refused():
     crew = Crew(lambda: PlantEnv(SHORT), SHORT, policies, QUIET, OperationConfig(clock="wall"), seed=1)
     with pytest.raises(ValueError, match="cannot be sent to a process of its own"):
         ProcessOperation(crew, PlantEnv(SHORT))
-
-
-def test_a_core_that_may_not_be_used_is_refused():
-    with pytest.raises(ValueError, match="core=100000 is none of the cores"):
-        ProcessOperation(
-            Crew(simulation, SHORT, {}, QUIET, OperationConfig(clock="wall", core=100000), seed=1), PlantEnv(SHORT)
-        )
 
 
 def test_options_of_an_operation_need_the_operation(tmp_path):

@@ -15,9 +15,9 @@ from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_start
 from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import constant
@@ -173,10 +173,10 @@ def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
     assert len(controller.solves) == 2 * plant.n_steps and not any(solve.late for solve in controller.solves)
 
 
-def test_a_preview_until_the_end_is_the_clairvoyant_optimum():
+def test_a_plan_of_a_whole_episode_with_a_preview_is_the_clairvoyant_optimum():
     plant = LinearQuadratic(horizon=3.0, noise=0.5)
     state, exogenous = episodes(plant, 2)
-    config = PredictiveConfig(horizon=3.0, period=0.5, ends=True, tolerance=0.0, iterations=300)
+    config = PredictiveConfig(horizon=3.0, period=3.0, tolerance=0.0, iterations=300)
     controller = RecedingHorizon(plant, plant.closure, config, forecast=Foreseen(exogenous, dt=plant.dt))
     costs = control_cost(plant, controller.fly(state, exogenous))
     for episode, cost in enumerate(costs.tolist()):

@@ -24,7 +24,7 @@ from rt_torchrl import (
 )
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.runs.results_table import next_steps
+from rt_torchrl.runs.results import next_steps
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import SPREAD_OF_IMITATION
 from rt_torchrl.trajectories.engines.parallel import without_warnings_of_libraries

@@ -8,7 +8,7 @@ import pytest
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SHORT = {"wind_turbine": 20.0, "flapping_wing": 0.05, "cryogenic_tank": 3000.0}

@@ -34,7 +34,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.protocols.served_system import served_system
+from rt_torchrl.systems.machine.rehearsal import served_system
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -380,7 +380,7 @@ def assert_same_episodes(whole, parts):
 def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = {}
-    exec("\n".join(blocks("policies_and_closures.md", "python")), found)
+    exec("\n".join(blocks("observations_and_costs.md", "python")), found)
     assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
 
 

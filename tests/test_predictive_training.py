@@ -11,18 +11,17 @@ from small_runs import SMALL
 from test_export_recipe import recipe
 from torch import nn
 
-from rt_torchrl.algorithm import ReinforcementTwinning, share_critic
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.figures.policy import policy_contours
-from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import make_planner
@@ -31,7 +30,7 @@ from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2))
-FIT = AssimilationConfig(iterations=10, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
 
 
 class Config(RunConfig):
@@ -204,18 +203,8 @@ def test_a_checkpoint_of_another_method_does_not_fit(tmp_path):
     config = Config(episodes=1, log_dir=tmp_path / "other", compiled=False, twinning=SMALL)
     other = Run(config, config.plant())
     with pytest.raises(ValueError, match="do not fit"):
-        checkpoint.load(tmp_path / "checkpoint.pt", other.algorithm)
+        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", other.algorithm)
     other._held.release()
-
-
-def test_a_learner_without_a_cost_to_go_cannot_price_the_end():
-    plant = LinearQuadratic()
-    config = dataclasses.replace(PLANNER.receding_horizon, terminal="critic")
-    controller = PredictiveControl(plant, plant.closure, config)
-    with pytest.raises(ValueError, match="needs a learner with a method cost_to_go.*object has none"):
-        share_critic(object(), controller)
-    share_critic(object(), PredictiveControl(plant, plant.closure, PLANNER.receding_horizon))
-    assert controller.value is None
 
 
 def test_methods_and_policies_that_do_not_go_together_are_refused():
@@ -228,43 +217,6 @@ def test_methods_and_policies_that_do_not_go_together_are_refused():
     other = PredictiveControl(plant, plant.closure, PLANNER.receding_horizon)
     with pytest.raises(ValueError, match="another closure than the twin's"):
         make_planner(twin, other, PLANNER, generator=generator)
-    for method, window in (("receding_horizon", 5), ("whole_episodes", 5), ("short_horizon", 0)):
-        with pytest.raises(ValueError, match=f"method='{method}' of the planning does not go with"):
-            PlannerConfig(method=method, short_horizon=ShortHorizonConfig(window=window))
-
-
-@pytest.mark.parametrize("name", ["ddpg", "td3"])
-def test_a_critic_prices_the_end_of_a_window(name):
-    """Its cost-to-go is the critics' own number, by hand; the plans change with it, and without it there are none."""
-    planner = dataclasses.replace(PLANNER, receding_horizon=PredictiveConfig(horizon=0.3, terminal="critic"))
-    run = training(episodes=1, twinning=learner(name) | {"planner": planner, "arm": "twinning"})
-    algorithm, plant = run.algorithm, run.algorithm.twin.plant
-    algorithm.episode()
-    seen = algorithm.learner.observations()[:5].clone()
-    actions = algorithm.policies["model_free"](seen)
-    weights = {k: v for k, v in algorithm.learner.loss.state_dict().items() if "target" not in k}
-    prefix = next(k for k, v in weights.items() if k.endswith("0.weight") and v.shape[-1] == 3)
-    found = []
-    for number in range(algorithm.learner.method.critics):
-        x = torch.cat([seen, actions / 2.0], -1)  # the range of the action is ±2 N
-        for layer in (0, 2):
-            weight, bias = (weights[prefix.replace("0.weight", f"{layer}.{part}")] for part in ("weight", "bias"))
-            weight, bias = (weight[number], bias[number]) if weight.ndim == 3 else (weight, bias)
-            x = x @ weight.T + bias
-            x = x * torch.sigmoid(x) if layer == 0 else x
-        found.append(-x[:, 0])
-    expected = torch.stack(found).amax(0)
-    torch.testing.assert_close(algorithm.learner.cost_to_go(seen), expected)
-    controller, state = algorithm.policies["model_based"], plant.draw_initial_state(1, torch.Generator().manual_seed(1))
-    controller.begin()
-    priced = controller.act(0.0, state, torch.zeros(1, 1).double())
-    controller.value = lambda observation: 100.0 * observation.square().sum(-1)
-    controller.begin()
-    assert not torch.allclose(controller.act(0.0, state, torch.zeros(1, 1).double()), priced, atol=1e-3)
-    controller.value = None
-    with pytest.raises(ValueError, match="which no run folder holds; set value, or use terminal plant"):
-        controller.begin()
-    run._held.release()
 
 
 SHORT = {
@@ -302,19 +254,12 @@ def records(tmp_path, name, *options):
         pytest.param(
             "--policy scheduled --twinning.learner.algorithm td3 --twinning.arm model_based", marks=pytest.mark.slow
         ),
-        # Torch computes the gradients of a window that the critic prices, so that a solve takes tenths of a second.
-        pytest.param(
-            "--closure mlp --twinning.assimilation.segment 5 --twinning.planner.receding-horizon.terminal critic "
-            "--episodes 1 --horizon 5 --twinning.planner.receding-horizon.horizon 2",
-            marks=pytest.mark.slow,
-        ),
     ],
 )
 def test_the_turbine_takes_it_with_other_options(tmp_path, options):
     acted = [record for record in records(tmp_path, "wind_turbine", *options.split()) if "solve_median" in record]
     assert acted and all(record["late_solves"] == 0.0 for record in acted)
-    if "critic" not in options:  # one that has hardly learned prices the end of a window wrongly
-        assert all(record["real_cost"] < 0.5 for record in acted), [record["real_cost"] for record in acted]
+    assert all(record["real_cost"] < 0.5 for record in acted), [record["real_cost"] for record in acted]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from seeds_and_numbers import seeded
 from test_algorithm import flown, twinning, weights
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
 from rt_torchrl.steps.plan import Planner, WholeEpisodes
 from rt_torchrl.steps.short_horizon import ShortHorizon
@@ -37,7 +37,7 @@ LEARNERS = {
 PLANNERS = {
     "whole episodes": lambda twin, policy: WholeEpisodes(twin, policy, PlannerConfig(iterations=2)),
     "short horizon": lambda twin, policy: ShortHorizon(
-        twin, policy, PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10)), generator=seeded(1)
+        twin, policy, PlannerConfig(method="short_horizon", window=10, iterations=1), generator=seeded(1)
     ),
     "documented": lambda twin, policy: documented("planner.md", "Steps")(twin, policy),
 }
@@ -119,7 +119,7 @@ def test_a_learner_of_another_policy_is_refused():
 
 def test_configuration_names_the_parts():
     parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="expected_cost")}
-    short = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10))
+    short = PlannerConfig(method="short_horizon", window=10, iterations=1)
     found = twinning(PLANT, **parts, planner=short)
     kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
     assert kinds == ["ActorCritic", "ShortHorizon", "ExpectedCost"]

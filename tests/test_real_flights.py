@@ -20,9 +20,9 @@ from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 STEPS = 20

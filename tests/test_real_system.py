@@ -1,10 +1,12 @@
 """Real systems behind foreign interfaces and simulators that call, and what only a simulation can do."""
 
+import contextlib
 import dataclasses
 import json
 import re
 import threading
 
+import gymnasium
 import numpy as np
 import pytest
 import scipy.linalg
@@ -16,12 +18,12 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem
+from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem, SafetyConfig, SafetyLayer
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.calling_simulator import CallingSimulator
+from rt_torchrl.systems.adapters import CallingSimulator
 
 MILLIMETRES = torch.tensor([1e3, 1e3], dtype=torch.float64)
 
@@ -107,6 +109,33 @@ def test_a_seed_fixes_every_episode_by_its_number():
     later = connected(plant, seed=3)
     later.load_state_dict({"seed": 3, "episodes": 2})
     assert torch.equal(starts(later, 1), first[2:])
+
+
+class Counted(gymnasium.Wrapper):
+    """Gymnasium's pendulum, which counts its resets and keeps their seeds."""
+
+    def __init__(self):
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        self.seeds = []
+
+    def reset(self, *, seed=None, options=None):
+        self.seeds.append(seed)
+        return super().reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize("layer", [False, True])
+def test_an_episode_of_gymnasium_takes_one_reset_with_its_own_seed(layer):
+    machine, plant = Counted(), Pendulum(horizon=1.0)
+    env = GymWrapper(machine)
+    if layer:
+        env = SafetyLayer(env, SafetyConfig(interval=plant.dt), fallback=(0.0,))
+    applied = Reading(keys=("applied",)) if layer else None
+    machine.seeds.clear()
+    system = RealSystem(env, plant, state=Reading(of=angle_and_speed), applied=applied, seed=5)
+    starts = [system.rollout(3)["state"][0, 0] for _ in range(3)]
+    assert len(set(machine.seeds)) == 3 and None not in machine.seeds
+    system.set_seed(5)
+    assert torch.equal(system.reset()["state"][0], starts[0]) and not torch.equal(starts[0], starts[1])
 
 
 def test_a_system_without_seeds_goes_on_as_it_is():
@@ -358,6 +387,54 @@ def test_stepping_it_is_what_the_simulator_does_by_itself():
     # A call more than there are intervals: at the end, and then the simulator returns.
     assert len(flown) == PLANT.n_steps + 1 and flown["next", "done"][-1] and not flown["next", "done"][:-1].any()
     assert np.array_equal(np.array(told), flown["place and rate"].numpy())
+
+
+@pytest.mark.parametrize("real", [False, True])
+def test_a_simulator_at_the_end_of_its_episode_finishes_its_work(real):
+    """What follows the last call of the controller, such as writing results, is done: at once in a real system."""
+    env, still = environment(), lambda td: td.set("action", torch.zeros(td.batch_size + (1,), dtype=torch.float64))
+    CALLS.clear()
+    if real:
+        env = RealSystem(env, PLANT, state=Reading(keys=("place and rate",)), exogenous=(0.0,))
+    for count in range(2):
+        env.rollout(PLANT.n_steps, still)
+        assert ["ended"] * (count + real) == CALLS
+    env.close()
+    assert CALLS == ["ended"] * 2
+
+
+def test_a_simulator_that_swallows_the_end_of_an_abandoned_episode_does_not_hang_the_next_reset():
+    """As a callback of a C library does, whose exceptions go nowhere."""
+    finished = []
+
+    def swallowing(seed, controller):
+        for _ in range(50):
+            with contextlib.suppress(BaseException):
+                controller({"place and rate": np.zeros(2)})
+        finished.append(seed)
+
+    env = environment(swallowing)
+    env.rollout(3, lambda td: td.set("action", torch.zeros(1, dtype=torch.float64)))
+    env.reset()
+    assert finished == [0]
+    env.close()
+
+
+def test_a_simulator_that_never_returns_is_said():
+    released = threading.Event()
+
+    def stubborn(seed, controller):
+        with contextlib.suppress(BaseException):
+            for _ in range(9):
+                controller({"place and rate": np.zeros(2)})
+        released.wait()
+
+    env = environment(stubborn)
+    env.patience = 0.1
+    env.rollout(3, lambda td: td.set("action", torch.zeros(1, dtype=torch.float64)))
+    with pytest.raises(RuntimeError, match="has not returned 0.1 s after its episode was abandoned"):
+        env.reset()
+    released.set()
 
 
 def test_an_episode_that_is_left_ends_the_simulator():

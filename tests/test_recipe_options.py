@@ -24,14 +24,12 @@ from rt_torchrl.steps.config import (
     AssimilationConfig,
     ExogenousConfig,
     LearnerConfig,
-    LongTermMemoryConfig,
     PlannerConfig,
     RefereeConfig,
-    ShortHorizonConfig,
     TwinningConfig,
 )
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 
 HEADER = "! TurbSim\n"
@@ -70,14 +68,6 @@ def made(plant, **options):
 def test_options_out_of_range_are_refused(plant, options, message):
     with pytest.raises(ValueError, match=message):
         made(plant, **options)
-
-
-def test_weights_of_another_task_are_refused():
-    made = recipe("wind_turbine")
-    weights = made.EngineeringCost(pitch_rate=0.1)
-    assert made.Config(task="engineering", engineering=weights).plant().cost == weights
-    with pytest.raises(ValueError, match="weights of the task engineering"):
-        made.Config(engineering=weights)
 
 
 def test_wind_that_no_turbine_has_met_is_refused(tmp_path):
@@ -159,22 +149,22 @@ def test_a_plant_without_a_paper_has_no_words_of_it():
 
 
 @pytest.mark.parametrize(
-    ("words", "spread", "starts"),
+    ("words", "spread", "rate"),
     [
-        ([], 0.02, 32),
-        (["--start", "random"], 0.2, 32),
-        (["--preset", "paper"], 0.2, 0),
-        (["--starts", "random", "--episodes", "0"], 0.02, 32),  # what cannot be carried out
+        ([], 0.02, 0.01),
+        (["--start", "random"], 0.2, 0.01),
+        (["--preset", "paper"], 0.2, 0.02),
+        (["--starts", "random", "--episodes", "0"], 0.02, 0.01),  # what cannot be carried out
     ],
 )
-def test_the_help_shows_the_defaults_that_hold(words, spread, starts, capsys):
+def test_the_help_shows_the_defaults_that_hold(words, spread, rate, capsys):
     config = config_class_of(RECIPES / "wind_turbine.py")
     with pytest.raises(SystemExit) as ended:
         from_command_line(config, [*words, "--help"])
     printed = capsys.readouterr()
     assert ended.value.code == 0 and not printed.err
     said = " ".join(printed.out.replace("│", " ").split())
-    for option, value in (("exploration.spread FLOAT", spread), ("planner.starts INT", starts)):
+    for option, value in (("exploration.spread FLOAT", spread), ("learner.target-rate FLOAT", rate)):
         described = said.split(f"--twinning.{option}")[1].split(" --")[0]
         assert f"(default: {value})" in described
 
@@ -245,16 +235,15 @@ CONFIGS = {
     EstimationConfig: {"errors": "newton", "prior": math.inf, "rounds": math.nan, "iterations": math.nan},
     ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
-    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},
-    LongTermMemoryConfig: {"capacity": math.inf, "correction": math.nan},
-    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "experience": math.inf},
+    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "stall": math.nan},
+    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "window": math.nan},
     LearnerConfig: {
         "critic_rate": math.inf,
         "batch_size": math.nan,
         "critic_hidden": (8, 0),
         "reward_scale": math.inf,
+        "memory_capacity": math.inf,
     },
-    ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_iterations": 0.5},
     ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
     SafetyConfig: {"interval": "0.5"},
     partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan, "patience": True},

@@ -9,20 +9,21 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from handwritten_study import recipe
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from small_runs import SMALL
-from test_export_recipe import leave_run, recipe
+from test_export_recipe import leave_run
 from test_optimal_control import quadratic_program
 
 from rt_torchrl import load_run
+from rt_torchrl.atomic_file import write_results
 from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import LimitConfig, exact_optimum, fitting, flown_starts, resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.runs.results_file import write_results
-from rt_torchrl.runs.results_table import results_table
+from rt_torchrl.runs.results import results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.rollout import Rollout

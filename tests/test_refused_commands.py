@@ -6,6 +6,7 @@ import math
 import re
 import struct
 import threading
+from functools import partial
 
 import pytest
 import torch
@@ -14,13 +15,13 @@ from served_plants import free_port
 from test_real_flights import HORIZON, algorithm
 from test_real_system import connected
 from test_safety import Clock, Failing, failing, fly, layer
-from test_served import ANSWERED, PLANT, SAMPLE, TAGS, Line, Time
+from test_served import ENTRIES, PLANT, Line, Time
 from test_served import connected as client_of
 
-from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, SafetyConfig, SafetyLayer
+from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, Register, SafetyConfig, SafetyLayer
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, RefusedRequestError
-from rt_torchrl.systems.reading import Actuation
+from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
+from rt_torchrl.systems.real_system import Actuation
 from rt_torchrl.systems.sound_part import sound_part
 
 HELD = {"double": 0.0, "float": 0.0, "whole": 0, "switch": False, "text": "off", "fixed": 0.0}
@@ -47,7 +48,8 @@ class Controls:
 
     def link(self, read=("position", "velocity"), written=("double",), timeout=5.0):
         names = [{tag: f"ns=2;s={tag}" for tag in tags} for tags in (read, written)]
-        return OpcUaLink(self.url, *names, timeout=timeout)
+        client = partial(pytest.importorskip("asyncua.sync").Client, self.url)
+        return OpcUaLink(client, *names, timeout=timeout)
 
 
 @contextlib.contextmanager
@@ -192,11 +194,8 @@ def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error
     """The machine holds its last command then, or its safe one; the record would say that it had the new one."""
     line = Unreliable(Time(), 0.1)
     line.fails_at, line.error = {6}, error
-    tags, actions, answers = TAGS.entries, PLANT.actions, {"sample": SAMPLE, "answered": ANSWERED}
-    client = ConnectedPlant(
-        *(line, {key: tags[key] for key in ("state", "exogenous")}, TAGS.commands, actions),
-        **{"period": 0.1, "clock": line.time, "sleep": line.time.sleep, **answers},
-    )
+    entries = {key: ENTRIES[key] for key in ("state", "exogenous")}
+    client = client_of(line, entries=entries)
     layer = SafetyLayer(client, SafetyConfig(interval=0.1), fallback=(0.0,))
     places = {key: Reading(keys=(key,)) for key in ("state", "exogenous", "applied")}
     system = RealSystem(layer, PLANT, **places, seed=None)
@@ -250,7 +249,8 @@ def modbus_server(addresses):
 
 def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason():
     port, end = modbus_server([(0, 8)])
-    link = ModbusLink("127.0.0.1", port, {"position": 0, "velocity": 4}, {"torque": 1000}, timeout=2.0)
+    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
+    link = ModbusLink(client, {"position": Register(0), "velocity": Register(4)}, {"torque": Register(1000)})
     try:
         link.connect()
         assert link.read() == {"position": 0.0, "velocity": 0.0}
@@ -258,7 +258,7 @@ def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason()
             link.write({"torque": 1.5})
         assert link.read() == {"position": 0.0, "velocity": 0.0}  # the connection is still there
         link.close()
-        beyond = ModbusLink("127.0.0.1", port, {"pressure": 40}, {"torque": 0}, timeout=2.0)
+        beyond = ModbusLink(client, {"pressure": Register(40)}, {"torque": Register(0)})
         beyond.connect()
         with pytest.raises(RefusedRequestError, match=r"pressure.*registers 40 to 43.*illegal data address"):
             beyond.read()

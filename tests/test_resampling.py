@@ -30,7 +30,6 @@ from rt_torchrl.fit.resampling import (
     resample,
     sensors_in,
 )
-from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.steps.hypotheses.fit import reread
@@ -312,7 +311,7 @@ def test_what_lies_between_the_rows_of_a_slow_log_is_no_measurement():
     assert autocorrelation(found.likelihood).abs().max() < 0.25
 
 
-@pytest.mark.parametrize("options", [{"method": "levenberg_marquardt"}, {"descent": DescentConfig(optimiser="lbfgs")}])
+@pytest.mark.parametrize("options", [{"method": "levenberg_marquardt"}, {"method": "lbfgs"}])
 def test_a_training_that_begins_with_a_slow_log_compares_its_rows_alone(options):
     """Without noise the true weights are found; an interpolated sample of the oscillator is off by up to 1/8 of it."""
     plant, log = slow_log(rows=60, noise=0.0)

@@ -5,10 +5,7 @@ import dataclasses
 import json
 import math
 import struct
-import subprocess
-import sys
 import time
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -25,15 +22,14 @@ from rt_torchrl.envs.pendulum.plant import UniformRod
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.closures import described_weights
-from rt_torchrl.runs import progress, results
-from rt_torchrl.runs.callbacks import EarlyStopping
+from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.progress import Progress
-from rt_torchrl.runs.results_table import SCREEN, closure_lines, fit_lines, next_steps, results_table
-from rt_torchrl.runs.results_table import progress as progress_line
+from rt_torchrl.runs.results import SCREEN, closure_lines, fit_lines, next_steps, results_table
+from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 from rt_torchrl.steps.imitation import of_each_role
@@ -163,11 +159,11 @@ def test_standard_errors_stand_beside_the_weights():
 def test_it_names_each_step_as_it_begins():
     told = []
     twinning().episode(told.append)
-    assert told == STEPS and set(progress.WORDS) == {"start", *STEPS}
+    assert told == STEPS and set(dashboard.WORDS) == {"start", *STEPS}
 
 
 def test_it_moves_while_a_step_is_under_way(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "IN_FILE", 0.05)
+    monkeypatch.setattr(dashboard, "IN_FILE", 0.05)
     with Progress(3) as bar:
         bar.doing("assimilate")
         time.sleep(1.2)
@@ -213,7 +209,7 @@ def test_compilation_is_watched():
 
 
 BLOCK = 2**15
-REAL = "cost/real episode (live policy)"
+REAL = "cost/real episode live policy"  # without brackets, which MLflow does not take
 
 
 def trained(folder, logger):
@@ -258,8 +254,7 @@ def test_mlflow_has_the_curves_and_the_options(tmp_path, monkeypatch):
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'run' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("linear_quadratic")
     (run,) = client.search_runs([experiment.experiment_id])
-    name = "cost/real episode live policy"  # MLflow takes no brackets
-    assert [point.value for point in client.get_metric_history(run.info.run_id, name)] == pytest.approx(costs)
+    assert [point.value for point in client.get_metric_history(run.info.run_id, REAL)] == pytest.approx(costs)
     assert run.data.params["twinning.virtual_episodes"] == "2" and run.info.status == "FINISHED"
     assert mlflow.active_run() is None
 
@@ -316,7 +311,7 @@ def test_a_callback_ends_the_training_and_its_results_are_written(stopped):
 
 def test_the_csv_logger_has_the_curves_and_the_final_costs(stopped):
     folder, metrics, _ = stopped
-    (curve,) = (folder / "csv" / "scalars" / "cost").glob("real episode (live policy).csv")
+    (curve,) = (folder / "csv" / "scalars" / "cost").glob("real episode live policy.csv")
     rows = [(int(step), float(value)) for step, value in csv.reader(curve.open())]
     assert rows == [(k, pytest.approx(episode["real_cost"])) for k, episode in enumerate(metrics["episodes"])]
     (final,) = (folder / "csv" / "scalars" / "final").glob("J_a live.csv")
@@ -439,22 +434,3 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
     record |= {f"rms/{name}": value for name, value in rms.items()}
     assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
-
-
-RULER = Path(__file__).parent / "ruler.py"
-
-
-def ruled(folder, model_based, model_free, paid):
-    folder.mkdir(parents=True)
-    unseen = {"J_a_model_based": {"mean": model_based}, "J_a_model_free": {"mean": model_free}}
-    metrics = {"summary": {"live": "model_free", "unseen": unseen}, "episodes": [{"real_cost": cost} for cost in paid]}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    (folder / "seconds.json").write_text("12.0")
-
-
-def test_a_row_has_ranges_and_counts_trainings_whose_dearer_policy_is_live(tmp_path):
-    ruled(tmp_path / "turbine-pitch" / "0", 1.0, 1.25, [2.0, 3.0])
-    ruled(tmp_path / "turbine-pitch" / "1", 1.5, 1.5, [4.0, 4.0])
-    command = [sys.executable, str(RULER), "--seeds", "2", "--folder", str(tmp_path), "--rows", "turbine, pitch"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "| turbine, pitch | 2 | 1.25 … 1.5 | 1 … 1.5 | 1 | 5 … 8 | 12 |"

@@ -20,13 +20,11 @@ from torch import nn
 
 from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_folder import RunFolder
-from rt_torchrl.runs.run_settings import require_same
-from rt_torchrl.runs.settings import BESIDE, config_of, read_settings
-from rt_torchrl.runs.tensor_file import load_tensors, plain, save_tensors
+from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
+from rt_torchrl.runs.settings import BESIDE, config_of, read_settings, require_same
 from rt_torchrl.steps.plan import MakePlan
 
 HOLDER = """
@@ -457,7 +455,7 @@ def test_a_checkpoint_holds_tensors_in_plain_containers(folder):
 def test_the_memory_samples_the_same_after_it_was_restored(folder, tmp_path):
     runs = [small_run(tmp_path / name, episodes=2, **QUICK) for name in ("one", "other")]
     for run in runs:
-        checkpoint.load(folder / "checkpoint.pt", run.algorithm)
+        run_folder.load_checkpoint(folder / "checkpoint.pt", run.algorithm)
     one, other = (run.algorithm.learner.memory for run in runs)
     assert len(one) == len(other) == 40
     for _ in range(3):
@@ -514,9 +512,9 @@ def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
     with monkeypatch.context() as patched:
         patched.setattr(*where, failing)
         with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint\.pt"):
-            checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
+            run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)
     assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint.pt"]
-    assert len(checkpoint.load(tmp_path / "checkpoint.pt", algorithm)) == 2
+    assert len(run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)) == 2
 
 
 @pytest.mark.parametrize(
@@ -535,7 +533,7 @@ def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, step, part):
     save_tensors(tmp_path / "checkpoint.pt", found)
     algorithm = small_run(tmp_path / "run", **QUICK).algorithm
     with pytest.raises(ValueError, match=f"weights do not fit this training.*{part}"):
-        checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
+        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)
 
 
 def test_a_checkpoint_without_a_policy_does_not_fit(folder, tmp_path):
@@ -543,13 +541,13 @@ def test_a_checkpoint_without_a_policy_does_not_fit(folder, tmp_path):
     del found["state"]["algorithm"]["model_free.gain"]
     save_tensors(tmp_path / "checkpoint.pt", found)
     with pytest.raises(ValueError, match=r"(?s)weights do not fit this training.*policies.*model_free\.gain"):
-        checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
+        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
 
 
 def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
     save_tensors(tmp_path / "checkpoint.pt", load_tensors(folder / "checkpoint.pt") | {"format": 2})
     with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 5"):
-        checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
+        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
 
 
 def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):

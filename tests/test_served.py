@@ -11,25 +11,29 @@ import torch
 from fault_counts import count
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
+from relay import Relay
 from served_plants import free_port, served
 from tensordict import TensorDict
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl.export.program import export_program
-from rt_torchrl.runs.configured_plant import physics_of
-from rt_torchrl.systems.protocols.connected_plant import ConnectedPlant
-from rt_torchrl.systems.protocols.link import LinkLostError
-from rt_torchrl.systems.protocols.modbus import ModbusLink
-from rt_torchrl.systems.protocols.relay import Relay
-from rt_torchrl.systems.protocols.served_plant import ServedPlant
-from rt_torchrl.systems.protocols.served_system import link_to, served_system
-from rt_torchrl.systems.protocols.server_process import ServerProcess
-from rt_torchrl.systems.protocols.tags import ANSWERED, SAMPLE, Tags
+from rt_torchrl.runs.run_config import physics_of
+from rt_torchrl.systems.machine.connected_plant import ConnectedPlant, LinkLostError
+from rt_torchrl.systems.machine.modbus import ModbusLink, Register
+from rt_torchrl.systems.machine.rehearsal import (
+    ServedPlant,
+    ServerProcess,
+    link_to,
+    served_system,
+    tags_of,
+    written_tags,
+)
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.rollout import Rollout
 
 PLANT = LinearQuadratic(horizon=2.0)
-TAGS = Tags.of(PLANT)
+ENTRIES = tags_of(PLANT)
+COMMANDS = ENTRIES.pop("commands")
 PROTOCOLS = [pytest.param("opcua", marks=pytest.mark.slow), "modbus"]  # a server of OPC UA starts in seconds
 
 
@@ -88,11 +92,11 @@ class Line:
     def __init__(self, time, period, down=()):
         self.time, self.period, self.down, self.connections = time, period, down, 0
         self.plant = ServedPlant(PLANT, (0.0,))
-        self.answer = {ANSWERED: math.nan, "command.force": math.nan}
+        self.answer = {"answered": math.nan, "command.force": math.nan}
 
     def _up(self):
         while (self.plant.sample + 1) * self.period <= self.time.now + 1e-12:
-            self.plant.advance(self.answer[ANSWERED], [self.answer["command.force"]])
+            self.plant.advance(self.answer["answered"], [self.answer["command.force"]])
         if any(begin <= self.time.now < end for begin, end in self.down):
             raise LinkLostError("down")
 
@@ -112,19 +116,10 @@ class Line:
         pass
 
 
-def connected(line, **options):
-    entries = TAGS.entries
+def connected(line, entries=ENTRIES, **options):
+    times = {"period": line.period, "clock": line.time, "sleep": line.time.sleep}
     return ConnectedPlant(
-        line,
-        entries,
-        TAGS.commands,
-        PLANT.actions,
-        period=line.period,
-        clock=line.time,
-        sleep=line.time.sleep,
-        sample=SAMPLE,
-        answered=ANSWERED,
-        **options,
+        line, entries, COMMANDS, PLANT.actions, **times, sample="sample", answered="answered", **options
     )
 
 
@@ -189,7 +184,7 @@ def test_a_plant_that_never_answers_is_said_in_a_sentence():
     ],
 )
 def test_a_client_that_cannot_work_is_refused(options, message):
-    given = {"entries": TAGS.entries, "commands": TAGS.commands, "period": 0.1, **options}
+    given = {"entries": ENTRIES, "commands": COMMANDS, "period": 0.1, **options}
     entries, commands = given.pop("entries"), given.pop("commands")
     with pytest.raises(ValueError, match=message):
         ConnectedPlant(Line(Time(), 0.1), entries, commands, PLANT.actions, **given)
@@ -217,22 +212,25 @@ def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
     torch.testing.assert_close(ends[whole], flown["next", "state"][whole], rtol=1e-12, atol=1e-12)
 
 
-def test_links_that_cannot_work_are_refused():
-    for options, message in (
-        ({"timeout": 0.0}, "timeout=0.0 s"),
+@pytest.mark.parametrize(
+    ("registers", "message"),
+    [
         ({"read": {}}, "read={} must name registers"),
-        ({"read": {"a": 0, "b": 200}}, "read spans 204 registers from 0 on"),
-        ({"written": {"a": 0, "b": 8}}, "addresses one behind the other"),
-    ):
-        given = {"read": {"a": 0}, "written": {"b": 4}, "timeout": 0.1, **options}
-        with pytest.raises(ValueError, match=message):
-            ModbusLink("localhost", 1, **given)
+        ({"read": {"a": Register(0), "b": Register(200)}}, "read spans 204 registers from 0 on"),
+        ({"written": {"a": Register(0), "b": Register(8)}}, "one behind the other"),
+        ({"written": {"a": Register(0, table="input")}}, "holding registers"),
+    ],
+)
+def test_registers_that_no_request_takes_are_refused(registers, message):
+    given = {"read": {"a": Register(0)}, "written": {"b": Register(4)}, **registers}
+    with pytest.raises(ValueError, match=message):
+        ModbusLink(None, **given)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_link_to_nobody_says_that_the_plant_does_not_answer(protocol):
-    link = link_to(protocol, TAGS, free_port(), period=1.0)
-    for work in (link.connect, link.read, lambda: link.write(dict.fromkeys(TAGS.written, 0.0))):
+    link = link_to(protocol, PLANT, free_port(), period=1.0)
+    for work in (link.connect, link.read, lambda: link.write(dict.fromkeys(written_tags(PLANT), 0.0))):
         with pytest.raises(LinkLostError):
             work()
     link.close()
@@ -409,42 +407,28 @@ def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
 def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
     config, parts = leave_run(tmp_path / "run", "wind_turbine")
     export_program(parts["model_based"], tmp_path / "law.pt2", physics_of(config))
-    module = recipe("in_service")
-    module.main(
-        module.Config(
-            policy=tmp_path / "law.pt2",
-            trusted=True,
-            port=free_port(),
-            pace=PACE,
-            seconds=20.0,
-            log_dir=tmp_path / "found",
-        )
-    )
-    found = json.loads((tmp_path / "found" / "in_service.json").read_text())
-    assert found["intervals"] == 40.0 and found["lost_connections"] == 0.0 and found["J_a"] > 0.0
+    module = recipe("served_turbine")
+    options = {"act": tmp_path / "law.pt2", "trusted": True, "observe": config.observe, "horizon": 20.0, "pace": PACE}
+    module.main(module.Config(**options, port=free_port(), log_dir=tmp_path / "service"))
+    results = json.loads((tmp_path / "service" / "in_service.json").read_text())
+    assert results["intervals"] == 40.0 and results["lost_connections"] == 0.0 and results["J_a"] > 0.0
 
 
 @pytest.mark.nightly
-def test_a_short_soak_counts_its_faults_and_handles(tmp_path):
-    module = recipe("soak")
-    options = {"hours": 0.02, "faults": 10.0, "pace": PACE, "horizon": 30.0, "port": free_port()}
+def test_trainings_of_the_same_real_time_are_compared(tmp_path):
+    module = recipe("asynchronous")
+    options = {"hours": 0.05, "horizon": 60.0, "seeds": (0,), "quick": True, "pace": 10.0}
     module.main(module.Config(log_dir=tmp_path, **options))
-    found = json.loads((tmp_path / "soak.json").read_text())
-    assert found["faults"] and found["safety_events"] > 0
-    assert len(found["faults"]) - 1 <= found["faults_logged"] <= len(found["faults"])  # the last may outlive the run
-    for process in ("learner", "acting", "server", "relay"):
-        assert found["processes"][process]["handles_last"] <= found["processes"][process]["handles_first"] + 2
+    (found,) = json.loads((tmp_path / "asynchronous.json").read_text())["seeds"]
+    assert found["synchronous"] > 0.0 and found["asynchronous"] > 0.0 and found["learning_share"] > 0.0
 
 
-@pytest.mark.nightly
-def test_jitter_is_measured_with_and_without_learning(tmp_path):
-    module = recipe("jitter")
-    module.main(module.Config(seconds=5.0, turns=1, log_dir=tmp_path))
-    found = json.loads((tmp_path / "jitter.json").read_text())
-    for kind in ("idle", "learning"):
-        assert found[kind]["intervals"] >= 100.0
-        assert 0.0 <= found[kind]["median_ms"] <= found[kind]["p99_ms"] <= found[kind]["max_ms"]
-    assert found["learner_ratio"] > 0.0
+def test_costs_are_summed_over_the_real_time_alone():
+    """Two hours: an hour and a half of episodes, half an hour of waiting between, and what comes later is left out."""
+    module = recipe("asynchronous")
+    config = module.Config(hours=2.0, horizon=1800.0)
+    found = module.course([1.0, 2.0, 3.0, 9.0], [1.0] * 4, [1800.0, 0.0, 0.0, 0.0], 5.0, config)
+    assert found == 1800.0 * (1.0 + 5.0 + 2.0 + 3.0) / 2.0
 
 
 @pytest.mark.parametrize(
@@ -452,10 +436,9 @@ def test_jitter_is_measured_with_and_without_learning(tmp_path):
     [
         ("served_turbine", "pace", 0.0),
         ("served_turbine", "port", 0),
-        ("soak", "hours", 0.0),
-        ("soak", "faults", -1.0),
-        ("jitter", "period", 0.0),
-        ("jitter", "turns", 0),
+        ("asynchronous", "pace", -1.0),
+        ("asynchronous", "hours", 0.1),
+        ("asynchronous", "seeds", ()),
     ],
 )
 def test_impossible_options_are_refused(name, option, value):
@@ -468,8 +451,11 @@ def test_impossible_options_are_refused(name, option, value):
 
 def test_the_example_makes_a_real_system_that_connects_at_its_reset():
     pytest.importorskip("asyncua")
-    (code,) = blocks("connect_your_machine.md", "python")
+    pytest.importorskip("pymodbus")
+    code, modbus = blocks("connect_your_machine.md", "python")
     names = {}
+    exec(modbus, names)
+    assert isinstance(names["link"], ModbusLink)
     exec(code.replace("opc.tcp://rig:4840", f"opc.tcp://127.0.0.1:{free_port()}"), names)  # nobody listens there
     system = names["machine"]()
     assert isinstance(system, RealSystem) and system.pace.period == system.plant.dt == 0.05

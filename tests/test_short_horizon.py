@@ -1,7 +1,6 @@
 """Planning over short windows on the oracle plant: its targets, its critic and its policies against direct sums."""
 
 import copy
-import dataclasses
 
 import pytest
 import torch
@@ -9,28 +8,38 @@ from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
-from rt_torchrl.steps.config import PlannerConfig, ShortHorizonConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-CONFIG = ShortHorizonConfig(window=10)
+SHORT = {"method": "short_horizon", "window": 10}
 
 
 def episodes(plant, count, seed):
     return Scenario(plant.draw_initial_state(count, seeded(seed)), plant.draw_exogenous(count, seeded(seed)))
 
 
-def planner(plant, config=CONFIG, **kind):
-    policy = plant.make_policy(seeded(3))
-    twin, planning = DigitalTwin(plant, plant.closure), PlannerConfig(short_horizon=config)
-    return ShortHorizon(twin, policy, planning, generator=seeded(1), **kind)
+def planner(plant):
+    twin = DigitalTwin(plant, plant.closure)
+    return ShortHorizon(twin, plant.make_policy(seeded(3)), PlannerConfig(**SHORT), generator=seeded(1))
 
 
-def test_targets_are_discounted_sums(monkeypatch):
-    monkeypatch.setattr(ShortHorizon, "mixing", 0.7)
-    plan = planner(LinearQuadratic(), dataclasses.replace(CONFIG, discount=0.9))
+@pytest.fixture
+def constants(monkeypatch):
+    """Other constants of the method than its own."""
+
+    def change(**values):
+        for name, value in values.items():
+            monkeypatch.setattr(ShortHorizon, name, value)
+
+    return change
+
+
+def test_targets_are_discounted_sums(constants):
+    constants(mixing=0.7, discount=0.9)
+    plan = planner(LinearQuadratic())
     costs, seen = (torch.rand(3, n, *width, generator=seeded(n)).double() for n, width in ((5, ()), (6, (2,))))
     values = plan.target(seen)[..., 0].detach()
     for b in range(3):
@@ -45,10 +54,11 @@ def test_targets_are_discounted_sums(monkeypatch):
             torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)  # rounding
 
 
-def test_the_critic_learns_what_the_policy_costs():
+def test_the_critic_learns_what_the_policy_costs(constants):
     """With a policy that stands still, the critic equals discounted sums over long flights, which it never sees."""
     plant = LinearQuadratic(noise=0.0)
-    plan = planner(plant, dataclasses.replace(CONFIG, policy_rate=1e-12, discount=0.9))
+    constants(policy_rate=1e-12, discount=0.9)
+    plan = planner(plant)
     for k in range(30):
         plan.sweep(*episodes(plant, 32, k))
     state, inputs = episodes(plant, 200, 1000)
@@ -62,9 +72,10 @@ def test_the_critic_learns_what_the_policy_costs():
     assert (found - true).square().mean() < 0.03 * true.var()
 
 
-def test_it_comes_near_the_best_policy():
+def test_it_comes_near_the_best_policy(constants):
+    constants(policy_rate=2e-2)
     plant = LinearQuadratic()
-    plan, unseen = planner(plant, dataclasses.replace(CONFIG, policy_rate=2e-2)), episodes(plant, 50, 99)
+    plan, unseen = planner(plant), episodes(plant, 50, 99)
 
     def cost(policy):
         return control_cost(plant, plan.twin.control(policy, *unseen)).mean()
@@ -83,10 +94,11 @@ class Profit(LinearQuadratic):
         return super().running_cost(t, state, applied, exogenous) - 3.0
 
 
-def test_a_negative_cost_descends_too():
+def test_a_negative_cost_descends_too(constants):
     """A constant changes no optimum. Without it 15 sweeps take the cost from 0.92 to 0.35."""
     plant, unseen = Profit(), episodes(LinearQuadratic(), 50, 99)
-    plan = planner(plant, dataclasses.replace(CONFIG, policy_rate=2e-2, discount=0.9))
+    constants(policy_rate=2e-2, discount=0.9)
+    plan = planner(plant)
     with torch.no_grad():
         before = plan.twin.cost(plan.learner, *unseen).item()
     for k in range(15):
@@ -95,11 +107,12 @@ def test_a_negative_cost_descends_too():
         assert before > -3.0 + 0.9 and plan.twin.cost(plan.learner, *unseen).item() < -3.0 + 0.4
 
 
-def test_what_was_learned_goes_on_after_a_plan_is_refused():
+def test_what_was_learned_goes_on_after_a_plan_is_refused(constants):
+    constants(policy_rate=100.0)
     plant = LinearQuadratic()
     policy = plant.make_policy(seeded(3))
     twin = DigitalTwin(plant, plant.closure)
-    config = PlannerConfig(iterations=1, short_horizon=dataclasses.replace(CONFIG, policy_rate=100.0))
+    config = PlannerConfig(iterations=1, **SHORT)
     found = make_planner(twin, policy, config, generator=seeded(1))
     before = copy.deepcopy(policy)
     plan = found.plan(episodes(plant, 8, 0))

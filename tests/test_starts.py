@@ -15,7 +15,6 @@ from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.fit.log import LogConfig
-from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
@@ -37,7 +36,7 @@ ClassicalLaw, recorded = record_log.ClassicalLaw, record_log.recorded
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(
     SMALL,
-    assimilation=AssimilationConfig(iterations=20, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    assimilation=AssimilationConfig(iterations=20, inputs="record", method="lbfgs"),
     planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2)),
 )
 
@@ -136,7 +135,7 @@ def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
 def believing(tmp_path_factory):
     """A run that believes a lag of the force, and options of runs that begin with it."""
     folder, known = tmp_path_factory.mktemp("believing") / "run", Suspecting(horizon=4.0)
-    config = HypothesesConfig(call=0.0, names=("lags",))
+    config = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
     options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
     Run(RunConfig(log_dir=folder, **options), LaggedActuator(known, "force", LAG), believed=known).train()
@@ -156,10 +155,10 @@ def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believ
     options = believing[1] | {"log_dir": tmp_path}
     late, alone = (
         RunConfig(**options | {"twinning": dataclasses.replace(SMALL, hypotheses=hypotheses)})
-        for hypotheses in (HypothesesConfig(names=("late",)), HypothesesConfig(which="none"))
+        for hypotheses in (HypothesesConfig(which=("late",)), HypothesesConfig(which=("none",)))
     )
     with pytest.raises(
-        ValueError, match=r"believes 'lags', but hypotheses 'lags' .*names of that run, or .*which none"
+        ValueError, match=r"believes 'lags', but hypotheses 'lags' .*which of that run, or .*which none"
     ):
         Run(late, Suspecting(horizon=4.0))
     assert not isinstance(Run(alone, Suspecting(horizon=4.0)).algorithm.twin, TwinEnsemble)

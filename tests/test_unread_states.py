@@ -18,12 +18,11 @@ from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.reading import Reading
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
 

@@ -5,8 +5,7 @@ from torch import Tensor, nn
 from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.systems.reading import Reading
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.real_system import Reading, RealSystem
 
 
 def angle_and_speed(observation: Tensor) -> Tensor:

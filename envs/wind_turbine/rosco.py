@@ -23,9 +23,8 @@ from torch import Tensor
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import RealController
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.calling_simulator import CallingSimulator, Controller
-from rt_torchrl.systems.reading import Reading
-from rt_torchrl.systems.real_system import RealSystem, episode_seed
+from rt_torchrl.systems.adapters import CallingSimulator, Controller
+from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 Report = Mapping[str, Any]

@@ -32,8 +32,8 @@ PAIRS = 10
 """Number of pairs that approximate the curvature in a solve."""
 Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
-CostToGo = Callable[[Tensor], Tensor]
-"""Function from observations ``batch n_o`` to what comes after them ``batch``, in units of L_a."""
+FUTURES = 4
+"""Number of pairs of futures of a scattered forecast."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,17 +44,12 @@ class PredictiveConfig:
         horizon: length of the window over which a plan is made [s]; every plant needs its own.
         period: time between two plans [s]; None for ``hold``.
         hold: time for which a command is held [s]; None for the plant's control interval.
-        ends: whether a window ends with the episode, whose last intervals cost nothing after it; otherwise it rolls on.
         iterations: greatest number of iterations of L-BFGS-B in a solve.
         tolerance: relative decrease of the cost in an iteration below which a solve ends.
         deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
         forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, decaying
             to the mean of the inputs met so far with the time that fits them best, or scattered, several futures about
             the decaying one as its errors on these inputs scatter; until inputs have been met, they are held.
-        pairs: number of pairs of futures of the scattered forecast.
-        terminal: cost of the state at the end of a window of :class:`PredictiveControl`: plant for the plant's own
-            where the window ends with the episode, or critic for the value that the model-free half has learned of what
-            comes after the window.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
             virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
@@ -65,13 +60,10 @@ class PredictiveConfig:
     horizon: float = 1.0
     period: float | None = None
     hold: float | None = None
-    ends: bool = False
     iterations: int = 20
     tolerance: float = 1e-4
     deadline: float = math.inf
     forecast: Literal["held", "decaying", "scattered"] = "decaying"
-    pairs: int = 4
-    terminal: Literal["plant", "critic"] = "plant"
     virtual_episodes: int = 3
 
     def __post_init__(self) -> None:
@@ -80,7 +72,7 @@ class PredictiveConfig:
             value = getattr(self, argument)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{argument}={value} s of the receding horizon must be positive.")
-        for argument, least in (("iterations", 1), ("tolerance", 0.0), ("pairs", 1), ("virtual_episodes", 1)):
+        for argument, least in (("iterations", 1), ("tolerance", 0.0), ("virtual_episodes", 1)):
             if not getattr(self, argument) >= least:
                 value = getattr(self, argument)
                 raise ValueError(f"{argument}={value} of the receding horizon must be at least {least}.")
@@ -167,8 +159,7 @@ class RecedingHorizon:
         config: parameters.
         forecast: forecast of the exogenous inputs; None holds what is measured.
         tail: cost V after the horizon, of the time, the end states and the inputs there, of several futures their mean,
-            in units of L_a·s; None for none. A window that ends with the episode has the plant's ``terminal_cost``
-            instead.
+            in units of L_a·s; None for none.
 
     Raises:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
@@ -241,17 +232,14 @@ class RecedingHorizon:
         Raises:
             DivergenceError: if the model diverges under every start of a first plan.
         """
-        k = round(t / self.plant.dt)
-        n = min(self.horizon, self.plant.n_steps - k) if self.config.ends else self.horizon
-        ends = self.config.ends and k + n == self.plant.n_steps
-        self.cost.terminal = self.plant.terminal_cost if ends else None
+        n = self.horizon
         inputs = self.forecast(t, exogenous, n)
         first, found = not self._plans, []
         for episode in range(len(state)):
             safe_point()
             begins, coming = state[episode].expand(inputs.shape[1], -1), inputs[episode]
             began = time.perf_counter()
-            if self._tail is not None and not ends:
+            if self._tail is not None:
                 self.cost.terminal = functools.partial(_after, self._tail, t + n * self.plant.dt, coming[:, -1].mean(0))
             self.cost.begin(begins, coming, start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
@@ -348,9 +336,6 @@ class PredictiveControl(nn.Module):
         closure: closure of the model, such as that of a twin, which is trained in place.
         config: parameters.
 
-    The attribute ``value`` is the cost-to-go for ``terminal="critic"``, a function of the observation in units of L_a;
-    the algorithm sets it to that of its learner.
-
     Raises:
         ValueError: if :class:`RecedingHorizon` refuses the parameters, or the closure is not on the CPU.
     """
@@ -362,19 +347,12 @@ class PredictiveControl(nn.Module):
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
         self.forecast = self._unlearned()
-        self.value: CostToGo | None = None
-        tail = self._tail if config.terminal == "critic" else None
         timeless = dataclasses.replace(config, deadline=math.inf)
         self._acting, self._virtual = (
-            RecedingHorizon(plant, closure, chosen, forecast=self.forecast, tail=tail) for chosen in (config, timeless)
+            RecedingHorizon(plant, closure, chosen, forecast=self.forecast) for chosen in (config, timeless)
         )
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
-
-    @property
-    def terminal(self) -> str:
-        """What prices the end of a window."""
-        return self._config.terminal
 
     @property
     def virtual_episodes(self) -> int:
@@ -390,17 +368,8 @@ class PredictiveControl(nn.Module):
         decaying = Decaying(torch.zeros_like(still), still, dt=plant.dt)
         if config.forecast == "decaying":
             return decaying
-        deviations = still.new_zeros(config.pairs, round(config.horizon / plant.dt), len(still))
+        deviations = still.new_zeros(FUTURES, round(config.horizon / plant.dt), len(still))
         return Scattered(decaying, deviations, -still, still.clone())
-
-    def _tail(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        if self.value is None:
-            raise ValueError(
-                "terminal='critic' of the receding horizon needs the critic of a learner, which no run folder holds; "
-                "set value, or use terminal plant."
-            )
-        plant = self._plant[0]
-        return plant.dt * self.value(plant.observe(t, state, exogenous))
 
     def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
@@ -414,7 +383,7 @@ class PredictiveControl(nn.Module):
         over = {"dt": plant.dt, "horizon": min(self._acting.horizon, records.shape[1] - 1) * plant.dt}
         fitted: Decaying | Scattered = Decaying.fitted(records, **over)
         if isinstance(self.forecast, Scattered):
-            fitted = Scattered.fitted(fitted, records, **over, pairs=self._config.pairs)
+            fitted = Scattered.fitted(fitted, records, **over, pairs=FUTURES)
             fitted.deviations = fitted.reaching(self.forecast.deviations.shape[1])
         self.forecast.load_state_dict(fitted.state_dict())
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
-from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
+from rt_torchrl.control.predictive_control import FUTURES, PredictiveConfig, RecedingHorizon
 from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_start
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
@@ -209,7 +209,7 @@ def forecasts(plant: Plant, exogenous: Inputs, window: PredictiveConfig) -> dict
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
     over = {"dt": plant.dt, "horizon": min(window.horizon, 0.5 * plant.horizon)}
     decaying = Decaying.fitted(records, **over)
-    scattered = Scattered.fitted(decaying, records, **over, pairs=window.pairs)
+    scattered = Scattered.fitted(decaying, records, **over, pairs=FUTURES)
     return {"held": Held(), "decaying": decaying, "scattered": scattered, "preview": Foreseen(exogenous, dt=plant.dt)}
 
 

@@ -31,7 +31,6 @@ class DescentConfig:
         rate: learning rate of Adam; first step length of L-BFGS.
         gradient_limit: greatest norm of the (relative) gradient that Adam sees, infinite for no limit; L-BFGS has
             its line search instead.
-        second_moment: β₂ of Adam.
         tolerance: decrease of the (relative) cost in a step of L-BFGS, or greatest change of a weight, below which
             L-BFGS stops early; Adam never does.
     """
@@ -39,7 +38,6 @@ class DescentConfig:
     optimiser: Optimiser = "adam"
     rate: float = 0.1
     gradient_limit: float = 1.0
-    second_moment: float = 0.9
     tolerance: float = 1e-9
 
     def __post_init__(self) -> None:
@@ -47,14 +45,12 @@ class DescentConfig:
         for argument in ("rate", "gradient_limit"):
             if not getattr(self, argument) > 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
-        if not 0.0 <= self.second_moment < 1.0:
-            raise ValueError(f"second_moment={self.second_moment} must lie in [0, 1).")
         if not self.tolerance >= 0.0:
             raise ValueError(f"tolerance={self.tolerance} of the descent must not be negative.")
 
 
-SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1, second_moment=0.99) for rate in (0.02, 0.005))
-"""Adam's options for the two halves of :func:`by_small_steps`."""
+SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
+"""Adam's options for the two halves of :func:`by_small_steps`, beside β₂ = 0.99."""
 
 
 class Descended(NamedTuple):
@@ -95,19 +91,20 @@ class Descent:
     Args:
         module: module with the weights.
         config: options of the descent.
+        second_moment: β₂ of Adam.
     """
 
     _optimiser: torch.optim.Adam | torch.optim.LBFGS
 
-    def __init__(self, module: nn.Module, config: DescentConfig):
-        self.module, self.config = module, config
+    def __init__(self, module: nn.Module, config: DescentConfig, *, second_moment: float = 0.9):
+        self.module, self.config, self.second_moment = module, config, second_moment
         self.restart()
 
     def restart(self) -> None:
         """Forget the optimiser's state, because the weights have jumped."""
         weights = [w for w in self.module.parameters() if w.requires_grad]
         if self.config.optimiser == "adam":
-            self._optimiser = torch.optim.Adam(weights, lr=self.config.rate, betas=(0.9, self.config.second_moment))
+            self._optimiser = torch.optim.Adam(weights, lr=self.config.rate, betas=(0.9, self.second_moment))
         else:
             self._optimiser = torch.optim.LBFGS(
                 weights, lr=self.config.rate, tolerance_change=self.config.tolerance, line_search_fn="strong_wolfe"
@@ -167,7 +164,7 @@ def by_small_steps(module: nn.Module, cost: Callable[[], Tensor], iterations: in
         FloatingPointError: if the cost diverges at the weights that the descent starts from.
     """
     for config in SMALL_STEPS:
-        Descent(module, config).run(cost, iterations // 2)
+        Descent(module, config, second_moment=0.99).run(cost, iterations // 2)
 
 
 class _Finished(Exception):

@@ -1,8 +1,14 @@
-"""Recipes, which are files with a ``Config`` and a ``main``, and their command lines."""
+"""Command lines of recipes, which are files with a ``Config`` and a ``main``; recipes and plants by their names."""
 
 import dataclasses
+import importlib
+import inspect
 import json
+import logging
+import os
+import pkgutil
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -10,12 +16,26 @@ from typing import Any, TypeVar, cast
 
 import tyro
 
-from rt_torchrl.runs.machine import quieten_libraries
+import rt_torchrl.envs
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.runs.settings import module_of, named
+from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
 from rt_torchrl.trajectories.rollout import DivergenceError
 
 Configuration = TypeVar("Configuration")
+
+
+NOISY = ("torchrl", "torch.utils.cpp_extension")
+"""Loggers that report the inner work of a library."""
+
+
+def quieten_libraries() -> None:
+    """Keep log lines and warnings off the terminal that concern the libraries' own code, which a user cannot mend."""
+    os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")  # TorchRL sets its own level when it is loaded, which is later
+    for name in NOISY:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
 
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
@@ -77,8 +97,11 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
         ValueError: if the file cannot be read, is that of another recipe, or holds an option that does not exist or a
             value that it does not take.
     """
-    from rt_torchrl.runs.run_settings import as_written  # here, because --help needs none of it
-    from rt_torchrl.runs.settings import BESIDE, config_of
+    from rt_torchrl.runs.settings import (
+        BESIDE,
+        as_written,  # here, because --help needs none of it
+        config_of,
+    )
 
     try:
         text = path.read_text(encoding="utf-8")
@@ -129,3 +152,48 @@ def load_recipe(path: Path) -> ModuleType:
     if not callable(getattr(module, "main", None)):
         raise ValueError(f"recipe={path} has no function main that takes its Config.")
     return module
+
+
+def shipped_plants() -> dict[str, type[Plant]]:
+    """The plant class of each folder under ``rt_torchrl.envs``, by the folder's name."""
+    return {m.name: _class_in(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
+
+
+def plant_class(name: str) -> type[Plant]:
+    """The plant class that a name stands for.
+
+    Args:
+        name: folder of the plant under ``rt_torchrl.envs``, or ``FILE.py:NAME`` or ``package.module:NAME``.
+
+    Raises:
+        ValueError: if there is no such plant.
+    """
+    known = shipped_plants()
+    if ":" not in name:
+        if name not in known:
+            raise ValueError(
+                f"plant={name!r} does not exist; choose one of {', '.join(known)}, or name one of your own as "
+                "FILE.py:NAME or package.module:NAME."
+            )
+        return known[name]
+    found = named(name)
+    if not (inspect.isclass(found) and issubclass(found, Plant)):
+        raise ValueError(f"plant={name!r} is no class derived from Plant.")
+    return found
+
+
+def _class_in(folder: str) -> type[Plant]:
+    """The one plant class that ``<folder>/plant.py`` defines.
+
+    Raises:
+        ValueError: if it defines no plant, or more than one.
+    """
+    module = importlib.import_module(f"rt_torchrl.envs.{folder}.plant")
+    found = [
+        kind
+        for kind in vars(module).values()
+        if inspect.isclass(kind) and issubclass(kind, Plant) and kind.__module__ == module.__name__
+    ]
+    if len(found) != 1:
+        raise ValueError(f"{module.__name__} defines {len(found)} plants; a folder under envs holds exactly one.")
+    return found[0]

@@ -1,6 +1,12 @@
-"""The TensorBoard dashboard of a run: one scalar per quantity and episode, and the figures."""
+"""What a training shows while it runs: the TensorBoard dashboard, other loggers, and the progress bar."""
 
-from collections.abc import Mapping, Sequence
+import os
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,14 +14,16 @@ import numpy as np
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
+from tqdm import tqdm
 
-from rt_torchrl.runs.summary import on_the_twin
+from rt_torchrl.runs.results import on_the_twin, progress
+from rt_torchrl.runs.run_config import LoggerName
 from rt_torchrl.steps.config import Role
+from rt_torchrl.trajectories.engines.parallel import watched_compilation
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
 
-    from rt_torchrl.runs.mlflow_logger import MLflowLogger
 
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
@@ -61,6 +69,8 @@ GROUPS = {
     **{kind: kind for kind in ("faults/", "violations/", "excess/", "multiplier/")},
 }
 """Tags of entries of which an episode has several, by what they begin with."""
+REFUSED = re.compile(r"[^\w\-. /:]")
+"""What loggers beside TensorBoard take in no name: MLflow refuses brackets and commas."""
 OVER_THE_FIRST = ("real_cost", "J_p", "J_a_model_based", "J_a_model_free")
 """Costs that are shown over that of the first episode, too, as the paper shows them."""
 COSTS = [
@@ -77,14 +87,15 @@ class Dashboard:
         loggers: further loggers.
     """
 
-    def __init__(self, folder: Path, loggers: "Sequence[Logger | MLflowLogger]" = ()):
+    def __init__(self, folder: Path, loggers: "Sequence[Logger]" = ()):
         self._writer, self._loggers = SummaryWriter(str(folder)), loggers
         self._writer.add_custom_scalars({"cost": {"all costs": ["Multiline", COSTS]}})
 
     def _scalar(self, tag: str, value: float, step: int) -> None:
         self._writer.add_scalar(tag, value, step)
+        name = REFUSED.sub("", tag)
         for logger in self._loggers:
-            logger.log_scalar(tag, value, step=step)
+            logger.log_scalar(name, value, step=step)
 
     def settings(self, options: Mapping[str, Any]) -> None:
         """Tell the other loggers the options of the run, by their dotted names."""
@@ -176,7 +187,9 @@ class Dashboard:
     def close(self) -> None:
         self._writer.close()
         for logger in self._loggers:
-            logger.close() if hasattr(logger, "close") else None
+            logger.close()
+            if isinstance(logger.experiment, AbstractContextManager):  # MLflow's run, which is active until it exits
+                logger.experiment.__exit__(None, None, None)
 
 
 def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
@@ -191,3 +204,113 @@ def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     found |= {f"J_a {name} on the real system": one["J_a"]["mean"] for name, one in flown.items()}
     found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
     return {name: float(value) for name, value in found.items() if value is not None and np.isfinite(value)}
+
+
+def make_loggers(names: Sequence[LoggerName], folder: Path, plant: str) -> "list[Logger]":
+    """TorchRL's loggers of a run.
+
+    Args:
+        names: which ones.
+        folder: run folder; CSV files go to ``csv/`` in it, W&B's run has its name, and MLflow's store is ``mlflow.db``
+            in it or, if it is set, the one that ``MLFLOW_TRACKING_URI`` names.
+        plant: name of the plant, which is the project of W&B and the experiment of MLflow.
+    """
+    if not names:
+        return []
+    from torchrl.record import loggers  # here, because it loads TorchRL
+
+    store = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{(folder / 'mlflow.db').resolve()}"
+    make: dict[LoggerName, Callable[[], Logger]] = {
+        "csv": lambda: loggers.CSVLogger("csv", log_dir=str(folder)),
+        "wandb": lambda: loggers.WandbLogger(folder.name, log_dir=str(folder), project=f"rt_torchrl {plant}"),
+        "mlflow": lambda: loggers.MLFlowLogger(plant, tracking_uri=store),
+    }
+    return [make[name]() for name in names]
+
+
+WORDS = {
+    "start": "learning from what is known",
+    "interact": "real episode",
+    "learn": "model-free update",
+    "inputs": "fitting the input",
+    "assimilate": "assimilating",
+    "plan": "planning",
+    "switch": "comparing policies",
+}
+"""Words in which the bar shows each step of the algorithm."""
+ON_TERMINAL, IN_FILE = 0.5, 30.0
+"""Time between two refreshes [s]; it is longer in a file, which keeps every one of them."""
+
+
+class Progress:
+    """A bar over the real episodes that also moves during a step.
+
+    It shows the costs of the last episode, the present step with its time, and whether the compiler is at work. The
+    first graphs take a minute to compile, in which nothing else would move.
+
+    Args:
+        total: number of real episodes of the training.
+        done: number of episodes that were done before.
+    """
+
+    def __init__(self, total: int, done: int = 0):
+        self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True)
+        self._interval = ON_TERMINAL if sys.stderr.isatty() else IN_FILE
+        self._costs, self._doing, self._since = "", "starting", time.perf_counter()
+        self._compiling, self._alarm, self._ended = False, False, threading.Event()
+        self._believed: str | None = None
+        self._thread = threading.Thread(target=self._keep_moving, daemon=True)
+
+    def __enter__(self) -> "Progress":
+        self._watch = watched_compilation(self._compilation)
+        self._watch.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._watch.__exit__(None, None, None)
+        self._doing = ""
+        self._show()
+        self._bar.close()
+
+    def doing(self, what: str) -> None:
+        """Show what begins now: the name of a step of the algorithm, or any other words."""
+        self._doing, self._since = WORDS.get(what, what), time.perf_counter()
+        self._show()
+
+    def episode(self, record: dict[str, Any]) -> None:
+        """Count an episode and show its costs.
+
+        A line says when the twin's predictions begin or cease to be wrong, and when another twin is believed.
+        """
+        self._costs = progress(record)
+        alarm = bool(record.get("alarm", self._alarm))
+        if alarm != self._alarm:
+            found = record.get("warning", "the twin's predictions hold again")
+            self.write(f"episode {record['episode'] + 1}: {found}")
+        self._alarm = alarm
+        believed = record.get("believed")
+        if believed != self._believed:
+            said = f"the twin with {believed!r}" if believed else "the twin alone"
+            self.write(f"episode {record['episode'] + 1}: {said} is the likeliest; J_p and closure are its own")
+        self._believed = believed
+        self._bar.update()
+        self._show()
+
+    def write(self, line: str) -> None:
+        """Write a line above the bar."""
+        self._bar.write(line)
+
+    def _compilation(self, under_way: bool) -> None:
+        self._compiling = under_way
+
+    def _keep_moving(self) -> None:
+        while not self._ended.wait(self._interval):
+            self._show()
+
+    def _show(self) -> None:
+        seconds = time.perf_counter() - self._since
+        doing = f"{self._doing} {seconds:.0f} s{', compiling' if self._compiling else ''}" if self._doing else ""
+        self._bar.set_postfix_str("; ".join(part for part in (self._costs, doing) if part))

@@ -1,7 +1,8 @@
-"""Loading a run folder: its plant, its trained policies, its closure and its results, without a training."""
+"""A finished run in code: its plant, policies, closure and results, what-if episodes and figures."""
 
 import copy
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +11,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs import what_if
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.configured_plant import MakesPlant, plant_of, require_plant
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
-from rt_torchrl.runs.tensor_file import load_tensors
-from rt_torchrl.runs.user_code import named
+from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
+from rt_torchrl.runs.run_folder import load_tensors
+from rt_torchrl.runs.settings import BESIDE, class_of, config_of, named, read_settings, require_config
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -88,6 +91,7 @@ class LoadedRun:
             raise ImportError("table needs pandas: install rt_torchrl[logs], or read metrics['episodes'].") from error
         return pandas.json_normalize(self.metrics["episodes"]).set_index("episode")
 
+    @torch.no_grad()
     def simulate(
         self,
         policy: nn.Module,
@@ -97,7 +101,7 @@ class LoadedRun:
         on: str = "real",
         seed: int = 0,
     ) -> Trajectory:
-        """Fly a policy on the real system in simulation, or on the twin; see :func:`what_if.simulate`.
+        """Fly a policy on the real system in simulation, or on the twin.
 
         The twin is ``twin.believed``, that of the likeliest hypothesis. States of the trajectory are those of the plant
         that flies, of which sensors read the first ones; its cost is ``control_cost(run.twin.believed.plant, flown)``.
@@ -114,7 +118,25 @@ class LoadedRun:
             ValueError: if ``on`` is something else, or shapes do not fit the plant.
             DivergenceError: if the system diverges.
         """
-        return what_if.simulate(self, policy, exogenous, initial_state, on=on, seed=seed)
+        if on not in ("real", "twin"):
+            raise ValueError(f"on={on!r} must be real or twin.")
+        if not isinstance(policy, nn.Module | StateFeedback):
+            raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
+        believed = self.twin.believed
+        plant, closure = (self.plant, self._true_closure()) if on == "real" else (believed.plant, believed.closure)
+        generator = torch.Generator().manual_seed(seed)
+        single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
+        batches = ((exogenous, 3), (initial_state, 2))
+        count = max([len(given) for given, rank in batches if given is not None and given.dim() == rank], default=1)
+        # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
+        drawn = plant.draw_initial_state(count, generator)
+        start = drawn if initial_state is None else _start(plant, initial_state, count)
+        inputs = plant.draw_exogenous(count, generator) if exogenous is None else _inputs(plant, exogenous, count)
+        if isinstance(policy, StateFeedback | ClassicalController):
+            flown = policy.fly(start, inputs, closure, plant=plant)
+        else:
+            flown = Rollout(plant, closure, policy)(start, inputs)
+        return flown.each()[0] if single else flown
 
     def figure(self, name: str, flown: Trajectory | None = None) -> "Figure":
         """A figure of the training by name, as ``figures/`` of the run folder has it; see :meth:`figure_names`.
@@ -127,14 +149,14 @@ class LoadedRun:
         Raises:
             ValueError: if this run has no such figure.
         """
-        drawn = what_if.figures_of(self, flown)
+        drawn = self._figures(flown)
         if name not in drawn:
             raise ValueError(f"figure {name!r} does not exist in this run; choose one of {', '.join(sorted(drawn))}.")
         return drawn[name]
 
     def figure_names(self) -> Sequence[str]:
         """Names that :meth:`figure` takes."""
-        return sorted(what_if.figures_of(self, None))
+        return sorted(self._figures(None))
 
     def policy(self, role: str) -> nn.Module:
         """The trained policy of a role.
@@ -146,6 +168,51 @@ class LoadedRun:
             known = " or ".join(sorted(self.policies))
             raise ValueError(f"role={role!r} does not exist in this run; choose {known}, or run.live.")
         return self.policies[role]
+
+    def _true_closure(self) -> nn.Module:
+        """The real system's closure at the end of the training: a system that wears is not what it was."""
+        wear = self.config.wear(self.plant)
+        return self.plant.closure if wear is None else wear(self.config.effective().episodes - 1)
+
+    def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
+        """Every figure of a finished run by name, with an episode of its own; see :meth:`LoadedRun.figure`."""
+        from rt_torchrl import figures  # here, because Matplotlib takes long to load
+
+        snapshot = self._snapshot(flown)
+        recipe: Any = sys.modules.get(type(self.config).__module__)
+        own = getattr(recipe, "plant_figures", None)
+        drawn = {"flights": figures.flights(self.physics, {self.live: snapshot.record})} | figures.figures_of(snapshot)
+        return drawn | (own(snapshot) if own else {})
+
+    @torch.no_grad()
+    def _snapshot(self, flown: Trajectory | None) -> Snapshot:
+        """The state of a finished run, with an episode as the record: by default the first unseen one."""
+        live = self.live
+        record = self.simulate(self.policy(live), seed=UNSEEN_SEED) if flown is None else flown
+        record = record if record.states.dim() == 2 else record.each()[0]
+        read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
+        replay = self.twin.replayed(read)
+        process, signals = None, self.physics.acting_inputs
+        if self.config.twinning.arm != "model_free" and signals:
+            from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
+
+            acted = read.exogenous[:, : len(signals)]
+            process = ExogenousProcess(
+                acted, dt=self.physics.dt, signals=signals, config=self.config.twinning.exogenous
+            )
+        return Snapshot(
+            plant=self.physics,
+            known=self.physics is self.plant,
+            closure=self.twin.believed_law,
+            initial_closure=self.initial_closure,
+            policies={role: self.policy(role) for role in ("model_free", "model_based")},
+            live=live,
+            record=read,
+            replay=replay,
+            large_scale=None if process is None else process.mean,
+            realisations=None if process is None else process.sample(5, torch.Generator().manual_seed(0)),
+            episodes=self.metrics["episodes"],
+        )
 
 
 def load_run(
@@ -260,3 +327,33 @@ def _read_weights(folder: Path) -> dict[str, dict[str, Any]]:
             "and leaves the weights of the episodes done."
         )
     return load_tensors(file)
+
+
+def _start(plant: Plant, given: Tensor, count: int) -> Tensor:
+    """Given initial states, of which the unread ones may be left out."""
+    if given.shape[-1:] == (len(plant.readings),):
+        return plant.at_rest(_rows(given, "initial_state", count, (len(plant.readings),)))
+    return _rows(given, "initial_state", count, (len(plant.states),))
+
+
+def _rows(given: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:
+    """A tensor in double precision with a batch dimension of ``count``."""
+    if tuple(given.shape[-len(shape) :]) != shape or given.dim() - len(shape) not in (0, 1):
+        raise ValueError(f"{name} of shape {tuple(given.shape)} must have the shape {shape}, or a batch of it.")
+    rows = given.to(torch.float64).reshape(-1, *shape)
+    if len(rows) not in (1, count):
+        raise ValueError(f"{name} has {len(rows)} episodes, others {count}; give as many of each, or one.")
+    return rows.expand(count, *shape).contiguous()
+
+
+def _inputs(plant: Plant, exogenous: Tensor, count: int) -> Tensor:
+    acting, every = len(plant.acting_inputs), len(plant.inputs)
+    n, width = (*exogenous.shape[-2:],) if exogenous.dim() >= 2 else (0, 0)
+    if n < 1 or width not in (acting, every):
+        names = ", ".join(signal.name for signal in plant.acting_inputs)
+        raise ValueError(
+            f"exogenous of shape {tuple(exogenous.shape)} must have a row for each control interval and a column for "
+            f"each input ({names or 'none'})."
+        )
+    rows = _rows(exogenous, "exogenous", count, (n, width))
+    return rows if width == every else plant.with_previews(rows)

@@ -1,21 +1,43 @@
-"""The real side of a run: the system in simulation, and the episodes that judge on it."""
+"""The real system of a run: in simulation, operated beside the learning, and flown after the training."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.evaluation.unseen import (
+    Baseline,
+    Judged,
+    RealController,
+    TwinEpisodes,
+    UnseenEpisodes,
+    mean_with_confidence,
+)
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.imitation import clones
+from rt_torchrl.steps.start import Start
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operating_limits import OperatingLimits
-from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_config import SafetyConfig
+from rt_torchrl.systems.operation.operator import FIRST, Crew, Operation
+from rt_torchrl.systems.operation.process import ProcessOperation
+from rt_torchrl.systems.operation.simulated import SimulatedOperation
+from rt_torchrl.systems.real_system import RealSystem, episode_seed
+from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -87,3 +109,175 @@ def judged_on(
     physics = twin.plant
     unseen.physics, unseen.bounds = physics, StateBounds(plant.readings, config.twinning.bounded_states)
     return unseen
+
+
+EVENTS = "events.jsonl"
+"""File of the operation's events in a run folder."""
+NOISE = 2**20
+"""Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
+
+
+def learner_threads(config: RunConfig) -> int:
+    """Number of CPU threads of the learner; 0 leaves torch's default.
+
+    Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
+    """
+    if config.threads or not (config.asynchronous and config.operation.clock == "wall"):
+        return config.threads
+    return min(torch.get_num_threads(), max(1, (os.cpu_count() or 1) - 1))
+
+
+def acting_by_name(policies: Mapping[Role, nn.Module], first: Start | None) -> dict[str, nn.Module]:
+    """Everything that may act in a run: the policies by role, and what the training begins with."""
+    found: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
+    teacher = None if first is None else first.teacher
+    return found if teacher is None else found | {FIRST: teacher}
+
+
+def operation_of(
+    config: RunConfig,
+    env: EnvBase,
+    make_env: Callable[[], EnvBase] | None,
+    plant: Plant,
+    policies: dict[str, nn.Module],
+    *,
+    folder: Path,
+) -> Operation:
+    """The operation of a run.
+
+    Args:
+        config: options of the run.
+        env: the real system.
+        make_env: function that makes the real system in another process; None if there is none.
+        plant: physics of the twin.
+        policies: everything that may act, by name.
+        folder: run folder, for the log of the events.
+
+    Raises:
+        ValueError: if episodes of the plant may end early; on the wall clock, if there is no function that makes the
+            real system, the device is not the CPU, or what acts cannot be sent to another process.
+    """
+    if plant.end_cost is not None:
+        raise ValueError(
+            f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
+            "--asynchronous."
+        )
+    options = config.operation
+    crew = Crew(
+        make_env or (lambda: env),
+        plant,
+        policies,
+        config.twinning.exploration,
+        options,
+        seed=episode_seed(config.seed, NOISE),
+    )
+    log = folder / EVENTS
+    if options.clock == "simulated":
+        learning = round(options.learning * plant.n_steps)
+        return SimulatedOperation(crew.operator(env), learning=learning, log=log)
+    if make_env is None:
+        raise ValueError(
+            "clock='wall' needs the real system in a process of its own; give Run(..., env=) a function that makes it."
+        )
+    if config.device != "cpu":
+        raise ValueError(f"clock='wall' acts on the CPU alone, and device={config.device!r}; give --device cpu.")
+    return ProcessOperation(crew, env, log=log)
+
+
+def end_operation(algorithm: ReinforcementTwinning) -> None:
+    """End the operation of the real system, if it operates while the algorithm learns."""
+    if algorithm.operating is not None:
+        algorithm.operating.operation.close()
+
+
+class Contender(NamedTuple):
+    """A controller that is to fly the real system, and what it is called before it does."""
+
+    called: str
+    fly: Callable[[], Trajectory]
+
+
+class RealFlights(NamedTuple):
+    """What a controller has flown on the real system after the training, and what that cost."""
+
+    flown: Trajectory
+    judged: Judged
+
+
+def contenders(
+    config: RunConfig,
+    system: RealSystem,
+    algorithm: ReinforcementTwinning,
+    untrained: Mapping[Role, nn.Module],
+    first: type[ClassicalController] | None,
+    baselines: Mapping[str, Baseline],
+    *,
+    device: torch.device,
+) -> dict[str, Contender]:
+    """The controllers that are to fly the real system after the training, by name.
+
+    These are the live policy, unless it still has the random weights that it began with; the controller that the
+    training has begun with; and the controllers that nothing but the real system can fly.
+
+    Args:
+        config: options of the run.
+        system: the real system.
+        algorithm: the training at its end.
+        untrained: the policies before it.
+        first: class of the controller that the real system has had so far.
+        baselines: controllers that are judged beside the policies.
+        device: device of the twin.
+    """
+    found: dict[str, Contender] = {}
+    if not config.real_unseen:
+        return found
+    asked = RealEpisodes(system, config.real_unseen, device=device)
+    live = algorithm.referee.live
+    policy = algorithm.policies[live]
+    known = config.start != "random" or isinstance(policy, StateFeedback)
+    if known or not clones(policy, untrained[live]):
+        found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
+    if config.start == "controller" and first is not None:
+        controller = first(algorithm.twin.plant).to(device)
+        name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
+        found[name] = Contender(name, partial(asked.fly, controller))
+    for name, law in baselines.items():
+        if isinstance(law, RealController):
+            found[name] = Contender(name, partial(asked.fly_baseline, law))
+    return found
+
+
+def announcement(found: Mapping[str, Contender], count: int) -> str:
+    """How many flights of whom there will be on the real system, where each controller makes so many."""
+    each = ", ".join(f"{count} of {one.called}" for one in found.values())
+    return f"{count * len(found)} flights on the real system: {each}; they count as paid"
+
+
+def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:
+    """The entry ``real_unseen`` of the summary.
+
+    Args:
+        flights: flights by the name of the controller.
+        J_p: costs of the twin on the flights of the live policy, by name; empty without such flights.
+    """
+    return {
+        "controllers": {
+            name: {"episodes": len(one.judged.control_costs)} | one.judged.statistics() for name, one in flights.items()
+        },
+        "costs": {name: one.judged.control_costs.tolist() for name, one in flights.items()},
+    } | {name: mean_with_confidence(costs) for name, costs in J_p.items()}
+
+
+def paid_before(folder: Path) -> list[float | None]:
+    """J_a of the flights that earlier ends of a resumed run have made; null stands for one that is not finite."""
+    try:
+        found = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    before: list[float | None] = found["summary"]["cost_of_learning"].get("judging", [])
+    return before
+
+
+def paid(flights: Mapping[str, RealFlights]) -> list[float]:
+    """J_a of every flight."""
+    return [cost for one in flights.values() for cost in one.judged.control_costs.tolist()]

@@ -1,7 +1,9 @@
-"""The results of a run in numbers, as ``metrics.json`` holds them."""
+"""The results of a run in numbers, as ``metrics.json`` holds them, and as a table for the terminal."""
 
+import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,12 +13,24 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.checks import rms_error, visited_features
+from rt_torchrl.evaluation.limits import (
+    FOR_PERCEPTRONS,
+    Contender,
+    LimitConfig,
+    exact_optimum,
+    few_starts,
+    limit,
+    predictive,
+)
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
+from rt_torchrl.runs.console import call_of
+from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.imitation import of_each_role
+from rt_torchrl.steps.report import in_words
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -232,3 +246,379 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
         for step, seconds in record["seconds"].items():
             total[step] = total.get(step, 0.0) + seconds
     return total
+
+
+def on_the_twin(unseen: Mapping[str, Any]) -> bool:
+    """Whether the costs on unseen episodes are those of the twin, and not of the real system or its simulation.
+
+    Args:
+        unseen: entry ``unseen`` of the summary; that of an earlier version does not say.
+    """
+    return unseen.get("judged_on") == "twin"
+
+
+def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], Role]:
+    """What the policy of a run has cost on the system, not on the run's own twin, and the role of that policy.
+
+    Returns:
+        The entry ``unseen``, or entries of the same names from the flights on the real system; and the live role,
+        or the live one, which has made these flights.
+
+    Raises:
+        ValueError: if the run was judged on its own twin alone.
+    """
+    unseen = summary["unseen"]
+    if not on_the_twin(unseen):
+        return unseen, summary["live"]
+    real, live = summary.get("real_unseen", {"controllers": {}}), summary["live"]
+    if live not in real["controllers"]:
+        raise ValueError(
+            "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run "
+            "by --resume and --real-unseen, which flies its live policy on the real system."
+        )
+    flown = real["controllers"]
+    others = {name: found for name, found in flown.items() if name != live}
+    merit = {name: found["merit"] for name, found in flown.items()}
+    count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
+    return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live
+
+
+def reference_entry(
+    config: RunConfig,
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    better: nn.Module,
+) -> dict[str, Any]:
+    """The entry ``reference`` of the summary; nothing without the option ``reference``.
+
+    Args:
+        config: options of the run.
+        unseen: the unseen episodes.
+        make_policy: function that draws a random policy of the class.
+        better: the better policy of the training.
+    """
+    if not config.reference:
+        return {}
+    optimum = exact_optimum(unseen, make_policy, **(FOR_PERCEPTRONS if config.policy == "mlp" else {}))
+    known, cost = config.limit() if config.limit_episodes else None, unseen.control_costs(better).mean().item()
+    compared = {
+        "J_a": optimum.cost,
+        "J_a_of_each_start": optimum.costs,
+        "better_over_reference": cost / optimum.cost,
+    }
+    if known is not None:
+        few = unseen.first(config.limit_episodes)
+        compared |= {"limit": beside_the_limit(few, known, {"optimum": optimum.policy, "better": better})}
+    return {"reference": compared}
+
+
+def beside_the_limit(episodes: UnseenEpisodes, known: LimitConfig, policies: dict[str, nn.Module]) -> dict[str, Any]:
+    """The limit, and what policies and model predictive control cost over it on the same episodes.
+
+    Args:
+        episodes: the episodes.
+        known: how the limit is computed.
+        policies: the policies by name.
+    """
+    best = limit(episodes, few_starts(episodes, known), hold=known.hold, config=known.descent)
+    costs = {name: episodes.control_costs(policy).mean().item() for name, policy in policies.items()}
+    found = {"episodes": len(best.costs), "J_a": best.mean, **entry(best)}
+    found |= {f"{name}_over_limit": cost / best.mean for name, cost in costs.items()}
+    if known.window is None:
+        return found
+    planned = predictive(episodes, known.window)
+    return found | {"mpc": {"J_a": planned.mean, "over_limit": planned.mean / best.mean, **entry(planned)}}
+
+
+def entry(contender: Contender) -> dict[str, Any]:
+    """The plant's own quantities, times and details of a contender."""
+    times = {} if contender.milliseconds is None else {"milliseconds": contender.milliseconds}
+    return {"merit": contender.merit, **times, **contender.details}
+
+
+SCREEN = 24
+"""Lines of a terminal that need no scrolling."""
+LEAST_WEIGHTS = 4
+MOST_ERRORS = 2
+"""Number of RMS errors of the twin on the progress line."""
+WHERE = {
+    "simulation of the real system": " in simulation, with the closure that the real system was given",
+    "twin": " on the twin, not on the real system",
+}
+"""What the heading says of the place where the unseen episodes were flown; nothing where the system is simulated."""
+
+
+def progress(record: dict[str, Any]) -> str:
+    """The costs of an episode and its live policy, as the progress bar shows them."""
+    errors = {key.removeprefix("rms/"): value for key, value in record.items() if key.startswith("rms/")}
+    named = [("J_a mb", "J_a_model_based"), ("J_a mf", "J_a_model_free"), ("real", "real_cost")]
+    named = named if errors else [("J_p", "J_p"), *named]
+    shown = [f"{name} {in_words(record[key])}" for name, key in named if record.get(key) is not None]
+    return ", ".join([*rms_words(errors, most=MOST_ERRORS), *shown, f"live {record['live'].replace('_', '-')}"])
+
+
+def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
+    """RMS errors of the twin in words, each with its unit; None stands for one that is not finite.
+
+    Args:
+        errors: the errors, by ``STATE [UNIT]``.
+        most: greatest number of errors that are shown.
+    """
+    words = []
+    for label, value in list(errors.items())[:most]:
+        name, unit = label.removesuffix("]").split(" [")
+        finite = value is not None and math.isfinite(value)
+        words.append(f"{name} {value:.3g} {unit}".removesuffix(" -") if finite else f"{name} diverges")
+    return [f"RMS {words[0]}", *words[1:]] if words else []
+
+
+def results_table(metrics: dict[str, Any]) -> str:
+    """The table of results that the terminal shows at the end of a run."""
+    found = metrics["summary"]
+    unseen, n = found["unseen"], found["unseen"]["episodes"]
+    where = WHERE.get(unseen.get("judged_on", ""), "")
+    twin = " on the twin" if on_the_twin(unseen) else ""
+    width = 22 + len(twin)
+    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
+    lines.append(f"  {'cost':<{width}}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
+    # A twin has no J_p on episodes that it has flown itself.
+    rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
+    for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
+        rows.append((f"J_a {role.replace('_', '-')}{twin}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
+    for name, before, after, ratio in rows:
+        means = f"{_number(unseen[before]['mean'], '.5g'):>12}{_number(unseen[after]['mean'], '.5g'):>12}"
+        lines.append(f"  {name:<{width}}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
+    if "J_a_untrained" in unseen:
+        shares = ", ".join(_share(role, found[f"J_a_over_untrained_{role}"]) for role in ROLES)
+        mean = _number(unseen["J_a_untrained"]["mean"], ".4g")
+        lines.append(f"  over a random start's mean J_a{twin} of {mean}: {shares}")
+    if "reference" in found:
+        best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
+        best, share = _number(best, ".5g"), _number(share, ".3f")
+        lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
+        lines += limit_lines(found["reference"])
+    for name, baseline in unseen["baselines"].items():
+        lines.append(
+            f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
+        )
+    lines += merit_lines(unseen)
+    lines += real_lines(found.get("real_unseen"))
+    paid = found["cost_of_learning"]
+    least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
+    judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
+    lines.append(
+        f"  live at the end: {found['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
+        f"{paid['episodes']} episodes{judging}, largest {most}"
+    )
+    lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
+    lines += alarm_lines(metrics["episodes"])
+    lines += fit_lines(found.get("twin"))
+    room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
+    errors = found.get("twin", {}).get("standard_errors", {})
+    lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room), errors=errors)
+    lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
+    return "\n".join(lines)
+
+
+def real_lines(found: dict[str, Any] | None) -> list[str]:
+    """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
+    if found is None:
+        return []
+    lines = []
+    if "J_p" in found:
+        before, after = (_number(found[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
+        lines.append(f"  J_p on the real system: {after}, with the first closure {before}")
+    for name, one in found["controllers"].items():
+        mean, who = _number(one["J_a"]["mean"], ".5g"), name.replace("_", "-")
+        lines.append(f"  J_a on the real system, {one['episodes']} flights of {who}: {mean} {_interval(one['J_a'])}")
+        lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
+    return lines
+
+
+def limit_lines(reference: dict[str, Any]) -> list[str]:
+    """Lines with the limit and what costs how much over it, if it was computed."""
+    if "limit" not in reference:
+        return []
+    best = reference["limit"]
+    shares = [
+        (name, best[key]) for name, key in (("better policy", "better_over_limit"), ("optimum", "optimum_over_limit"))
+    ]
+    if "mpc" in best:
+        shares.append(("model predictive control", best["mpc"]["over_limit"]))
+    text = ", ".join(f"{name} {_number(share, '.4f')}" for name, share in shares)
+    return [f"  limit on the first {best['episodes']} episodes: J_a {_number(best['J_a'], '.5g')}; over it: {text}"]
+
+
+def _number(value: float | None, digits: str) -> str:
+    """A number as text; None, which stands for a number that is not finite, becomes a dash."""
+    return "-" if value is None else format(value, digits)
+
+
+def _share(role: str, value: float | None) -> str:
+    return f"{role.replace('_', '-')} {_number(value, '.3g')}"
+
+
+def _interval(found: dict[str, Any]) -> str:
+    low, high = (_number(end, ".4g") for end in found["confidence_interval"])
+    return f"[{low}, {high}]"
+
+
+def merit_lines(unseen: dict[str, Any]) -> list[str]:
+    """Lines with the plant's own quantities under every controller: over all episodes, then over each kind with J_a."""
+    merits: dict[str, dict[str, Any]] = {role: unseen["merit"][role] for role in ROLES}
+    merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
+    if not merits[ROLES[0]]:
+        return []
+    heading = "on the twin, mean (median)" if on_the_twin(unseen) else "mean (median)"
+    lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
+    lines += _rows(merits)
+    for kind, found in unseen["categories"].items():
+        lines.append(f"  {kind}, {found['episodes']} of {unseen['episodes']} episodes")
+        lines += _rows({name: {"J_a": found[name]["J_a"]} | found[name]["merit"] for name in merits})
+    return lines
+
+
+def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
+    """Lines of a table, one for each quantity."""
+    lines = []
+    for name in next(iter(columns.values())):
+        shown = (_value(merit[name]) for merit in columns.values())
+        lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
+    return lines
+
+
+def _value(found: dict[str, Any]) -> str:
+    """The mean of a quantity, and its median if it has one."""
+    return _number(found["mean"], ".4g") + (f" ({_number(found['median'], '.4g')})" if "median" in found else "")
+
+
+def fit_lines(twin: dict[str, Any] | None) -> list[str]:
+    """A line with the twin's RMS errors over the records, or the segments, that it was last fitted to."""
+    if not twin or not twin["rms"]:
+        return []
+    where = f"segments of {twin['segment']} intervals" if twin["segment"] else "its last records"
+    return [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
+
+
+def closure_lines(
+    closure: dict[str, Any], most: int = 1000, errors: dict[str, float | None] | None = None
+) -> list[str]:
+    """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
+
+    The true weights of the same names and the standard errors are shown, if there are any. Of more weights than
+    ``most``, those are shown that have changed most.
+    """
+    if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
+        return []
+    true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
+    described = closure.get("described", {})  # runs of 0.1.0 have none
+    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'std. error':>12}" if errors else "")]
+    lines[0] += f"{'true':>12}" if true else ""
+    chosen = list(closure["found"])
+    if len(chosen) > most:
+        change = {name: _change(closure["start"].get(name), closure["found"][name]) for name in chosen}
+        moved = sorted(chosen, key=change.__getitem__)[-most + 1 :]
+        chosen = [name for name in chosen if name in moved]
+    for name in chosen:
+        value = closure["found"][name]
+        weights = [closure["start"].get(name), value]
+        if errors:
+            weights.append(errors.get(name))
+        if true:
+            weights.append(true.get(name))
+        about = described.get(name, {"unit": "", "meaning": ""})
+        label = f"{name} [{about['unit']}]" if about["unit"] else name
+        shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
+        lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
+    if len(chosen) < len(closure["found"]):
+        lines.append(f"  {len(closure['found']) - len(chosen)} more, which have changed less, are in metrics.json")
+    return lines
+
+
+def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None = None) -> list[str]:
+    """Lines with what the twin lacks, as the hypotheses that explain the records have found it.
+
+    Args:
+        hypotheses: entry ``hypotheses`` of the summary.
+        believed: name of the likeliest, whose J_p and closure the table shows.
+    """
+    lines = []
+    for name, one in hypotheses.items():
+        named = {key: value for key, value in one["weights"].items() if isinstance(value, float)}
+        units = {key: one["described"].get(key, {}).get("unit", "") for key in named}
+        found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
+        line = f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else "")
+        lines.append(line + ("; J_p and closure weights are its own" if name == believed else ""))
+    return lines
+
+
+def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
+    """The number of alarms, and the last one."""
+    watched = [one for one in episodes if "alarm" in one]
+    if not watched:
+        return []
+    raised = sum(one["alarm"] > 0.0 for one in watched)
+    about = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
+    last = [f"  episode {one['episode']}: {one['warning']}" for one in watched if one.get("warning")][-1:]
+    return [f"  {about}", *last]
+
+
+def _change(start: float | None, found: float | None) -> float:
+    """Relative change of a weight; that of one that is not a finite number comes first."""
+    if start is None or found is None:
+        return float("inf")
+    return abs(found - start) / max(abs(start), abs(found), 1e-300)
+
+
+def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
+    """What to do with the run, from what its results say: one line for each thing.
+
+    Args:
+        metrics: content of ``metrics.json``.
+        folder: run folder.
+        config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
+    """
+    found, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
+    unseen, live = found["unseen"], found["live"]
+    cost = unseen[f"J_a_{live}"]["mean"]
+    classical = {name: baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    real = {name: one["J_a"]["mean"] for name, one in found.get("real_unseen", {}).get("controllers", {}).items()}
+    twin = on_the_twin(unseen) and live not in real
+    if live in real:  # a cost on the twin is not compared with one on the real system
+        cost, classical = real.pop(live), real
+    known = {name: value for name, value in classical.items() if value is not None}
+    best = min(known, key=known.__getitem__, default=None)
+    call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
+    steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
+    if cost is None:
+        where = "unseen episodes on the twin" if twin else "unseen episodes"
+        steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
+    elif best is not None and cost >= known[best]:
+        steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
+    elif found["better"] != live:
+        steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
+    else:
+        planner = None if config is None else config.twinning.planner.method
+        steps += _taking_away(live, folder, planner, found.get("believed"), alone=alone)
+    if twin:
+        steps.append(
+            "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
+        )
+    return "\n".join(f"  next: {step}" for step in steps)
+
+
+def _taking_away(live: str, folder: Path, planner: str | None, believed: str | None, *, alone: bool) -> list[str]:
+    """What to do with the live policy; model predictive control acts from here, and its model can be exported.
+
+    Model predictive control plans on the twin alone, also where a hypothesis explains the records better.
+    """
+    planned = live == "model_based" and planner == "receding_horizon"
+    if not alone:
+        model = "take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"
+        law = f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"
+        return [model if planned else law]
+    if planned:
+        model = "model that it plans on" if believed is None else f"twin with {believed}, on which it does not plan,"
+        return [f"take the {model} away: {call_of('export')} {folder} --what twin"]
+    role = "" if live == "model_based" else " --role model_free"
+    return [f"take the controller away: {call_of('export')} {folder}{role}"]

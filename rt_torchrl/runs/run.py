@@ -4,11 +4,13 @@ import copy
 import errno
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
@@ -18,27 +20,28 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
 from rt_torchrl.evaluation.limits import untrained_costs
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController
+from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, UnseenEpisodes
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs import checkpoint, real_flights, reference, results
-from rt_torchrl.runs.callbacks import Callback
-from rt_torchrl.runs.dashboard import Dashboard
-from rt_torchrl.runs.drawing import Drawing, PlantFigures, first_flights
-from rt_torchrl.runs.known_physics import known_physics
-from rt_torchrl.runs.loggers import make_loggers
-from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
-from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, learner_threads, operation_of
-from rt_torchrl.runs.progress import Progress
-from rt_torchrl.runs.real_flights import RealFlights
-from rt_torchrl.runs.real_side import judged_on, simulated
-from rt_torchrl.runs.results_table import next_steps, results_table
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_folder import RunFolder
-from rt_torchrl.runs.run_settings import as_written, flat
-from rt_torchrl.runs.run_start import start_of, twin_of
-from rt_torchrl.runs.tensor_file import save_tensors
+from rt_torchrl.runs import real_side, results
+from rt_torchrl.runs.command_line import quieten_libraries
+from rt_torchrl.runs.dashboard import Dashboard, Progress, make_loggers
+from rt_torchrl.runs.real_side import (
+    EVENTS,
+    RealFlights,
+    acting_by_name,
+    end_operation,
+    judged_on,
+    learner_threads,
+    operation_of,
+    simulated,
+)
+from rt_torchrl.runs.results import next_steps, results_table
+from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
+from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
+from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
+from rt_torchrl.runs.settings import as_written, flat
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
@@ -47,7 +50,72 @@ from rt_torchrl.steps.start import first_live
 from rt_torchrl.steps.switch import MakeReferee, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
+
+
+PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
+
+
+class Drawing:
+    """Draws the figures of a run, each once.
+
+    Args:
+        plant_figures: function that draws the figures that only this plant has.
+        animate: function that writes an animation of the last real episode to a path.
+    """
+
+    def __init__(self, plant_figures: PlantFigures, animate: Callable[[Snapshot, Path], None] | None):
+        self.plant_figures, self.animate = plant_figures, animate
+
+    def drawn(self, snapshot: Snapshot) -> dict[str, "Figure"]:
+        """The figures of a training."""
+        return figures.figures_of(snapshot) | self.plant_figures(snapshot)
+
+    def images(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
+        """Pixels of the figures of a training, by name."""
+        return {name: figures.pixels(figure) for name, figure in self.drawn(snapshot).items()}
+
+    def save(
+        self, snapshot: Snapshot, folder: Path, *, first: Mapping[str, "Figure"], last: Mapping[str, "Figure"]
+    ) -> dict[str, np.ndarray]:
+        """Write the figures and the animation at the end of a run.
+
+        Args:
+            snapshot: the training at its end.
+            folder: folder of the figures.
+            first: figures before those of the training, by name.
+            last: figures after them.
+
+        Returns:
+            Pixels of all figures.
+        """
+        folder.mkdir(exist_ok=True)
+        drawn = {**first, **self.drawn(snapshot), **last}
+        images = {name: figures.pixels(figure) for name, figure in drawn.items()}
+        for name, image in images.items():
+            figures.save_pixels(image, folder / f"{name}.png")
+        if self.animate:
+            self.animate(snapshot, folder / "animation.gif")
+        return images
+
+
+def first_flights(
+    unseen: UnseenEpisodes, live: Role, policy: nn.Module, baselines: Mapping[str, Baseline]
+) -> dict[str, "Figure"]:
+    """The figure of the first unseen episode under the live policy and the classical controllers.
+
+    It is left out on a real system of unknown closure, where these would be flights of their own.
+    """
+    if unseen.closure is None:
+        return {}
+    episode = unseen.first(1)
+    flown = {str(live): episode.fly(policy)}
+    flown |= {name: episode.fly_baseline(law) for name, law in baselines.items()}
+    return {"flights": figures.flights(unseen.physics, {who: one.each()[0] for who, one in flown.items()})}
 
 
 class Run:
@@ -71,8 +139,8 @@ class Run:
             beside the policies wherever the unseen episodes are flown under the true closure.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
-        replay: function of ``config.twinning.learner.memory`` and ``generator=`` that makes the memory of
-            :class:`ActorCritic`, if there is no ``learner``.
+        replay: function of ``config.twinning.learner.memory_capacity``, ``correction=`` and ``generator=`` that makes
+            the memory of :class:`ActorCritic`, if there is no ``learner``.
         planner: function of twin, policy, ``config.twinning.planner`` and ``generator=`` that makes the planner of step
             5, a :class:`Planner`.
         referee: function of ``config.twinning.referee`` and the role that starts live that makes the referee of step 6,
@@ -145,8 +213,8 @@ class Run:
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
             if self._held.resumes():
-                self._paid = real_flights.paid_before(self.folder)
-                self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
+                self._paid = real_side.paid_before(self.folder)
+                self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
         except BaseException:
             self._held.release()
             raise
@@ -299,7 +367,7 @@ class Run:
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
         done = [*self.episodes, record]
-        short = checkpoint.save(self._held.checkpoint, self.algorithm, done, kept=self.config.checkpoints)
+        short = save_checkpoint(self._held.checkpoint, self.algorithm, done, kept=self.config.checkpoints)
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
@@ -317,7 +385,7 @@ class Run:
     def _drop_half_an_episode(self) -> None:
         """Go back to the end of the last whole episode after an interrupt."""
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
-            self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
+            self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
 
     def _fly_the_real_system(self, bar: Progress) -> dict[str, RealFlights]:
         """The flights after the training that were asked for; before the first one the run says how many of whom."""
@@ -326,12 +394,12 @@ class Run:
         if len(self.episodes) < self.config.episodes and self.ended is None:
             return {}  # who has pressed Ctrl-C does not want the real system to go on
         parts = self.initial_policies, self._first, self.baselines
-        found = real_flights.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
+        found = real_side.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
         live = self.algorithm.referee.live
         if self.config.real_unseen and live not in found:
             bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
         if found:
-            bar.write(real_flights.announcement(found, self.config.real_unseen))
+            bar.write(real_side.announcement(found, self.config.real_unseen))
             bar.doing("judging on the real system")
         flown = {name: one.fly() for name, one in found.items()}
         return {name: RealFlights(one, self._on_the_real_system(one).judge(one)) for name, one in flown.items()}
@@ -356,9 +424,9 @@ class Run:
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         if real:
             summary["real_unseen"] = self._real_results(real)
-        summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_flights.paid(real)])
+        summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_side.paid(real)])
         better = self.algorithm.policies[summary["better"]]
-        summary |= reference.found(self.config, self.unseen, self.make_policy, better)
+        summary |= results.reference_entry(self.config, self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
@@ -375,7 +443,15 @@ class Run:
             on_it = self._on_the_real_system(flown.flown)
             costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
             J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
-        return real_flights.entries(real, J_p)
+        return real_side.entries(real, J_p)
 
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether this machine has what torch.compile needs; if not, the terminal shows what is missing."""
+    missing = missing_for_compilation() if device.type == "cpu" else None
+    if missing:
+        print(f"This machine lacks {missing}: running without torch.compile, several times slower.")
+    return missing is None

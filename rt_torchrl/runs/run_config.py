@@ -1,11 +1,12 @@
-"""The options that every recipe has."""
+"""The options that every recipe has, and what they make: plant, policies, closure, early stopping."""
 
 import copy
 import dataclasses
-from collections.abc import Callable
+import importlib.util
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import nn
@@ -16,11 +17,73 @@ from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.options import check_options, choices, require_widths, with_paths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
-from rt_torchrl.runs.callbacks import EarlyStopping
-from rt_torchrl.runs.loggers import LoggerName, require_loggers
-from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, ShortHorizonConfig, TwinningConfig
-from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, TwinningConfig
+from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
+
+Callback = Callable[[Sequence[dict[str, Any]]], str | None]
+"""Function of the entries of all episodes so far, as in ``metrics.json``; it returns why the training should end, or
+None to go on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarlyStopping:
+    """Ends a training whose live policy has not become better for a while.
+
+    The cost that counts is the live policy's mean J_a over the virtual episodes on the twin. An arm without a twin
+    reports none, and the cost of the real episode counts. Nothing is chosen by the unseen episodes.
+
+    Args:
+        patience: number of episodes in a row without a gain, at least 1.
+        least_gain: least gain that counts, as a share of the least cost so far.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+    """
+
+    patience: int
+    least_gain: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.patience < 1:
+            raise ValueError(f"patience={self.patience} must be at least 1 episode.")
+        if not 0.0 <= self.least_gain < 1.0:
+            raise ValueError(f"least_gain={self.least_gain} must lie in [0, 1), such as 0.01 for one per cent.")
+
+    def __call__(self, episodes: Sequence[dict[str, Any]]) -> str | None:
+        """Why the training should end, by the entries of its episodes; None to go on."""
+        least, since = float("inf"), 0
+        for episode in episodes:
+            cost = self.cost(episode)
+            gained = cost < (1.0 - self.least_gain) * least
+            least, since = (cost, 0) if gained else (least, since + 1)
+        if since < self.patience:
+            return None
+        return f"no gain of {100.0 * self.least_gain:g} % in the last {since} episodes"
+
+    @staticmethod
+    def cost(episode: dict[str, Any]) -> float:
+        """The cost of an episode that counts."""
+        found = episode.get(f"J_a_{episode['live']}", episode["real_cost"])
+        return float("inf") if found is None else float(found)
+
+
+LoggerName = Literal["csv", "wandb", "mlflow"]
+PACKAGES: dict[LoggerName, str] = {"wandb": "wandb", "mlflow": "mlflow"}
+"""Package that a logger needs."""
+
+
+def require_loggers(names: Sequence[LoggerName]) -> None:
+    """Refuse loggers that lack their package, before any work.
+
+    Raises:
+        ValueError: if there is one; it says what to install.
+    """
+    for name in names:
+        package = PACKAGES.get(name)
+        if package and importlib.util.find_spec(package) is None:
+            raise ValueError(f"loggers={name!r} needs a package that is not installed: pip install {package}.")
+
 
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""
@@ -273,7 +336,7 @@ class RunConfig:
         Hypotheses replay the whole state, and are left out where the twin is fitted to some sensors alone.
         """
         if self.twinning.assimilation.sensors:
-            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which="none"))
+            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which=("none",)))
         if self.start == "random":
             return twinning
         exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
@@ -291,7 +354,7 @@ class RunConfig:
         )
         if preset == "mpc":
             planner = found.twinning.planner
-            planner = dataclasses.replace(planner, method="receding_horizon", short_horizon=ShortHorizonConfig())
+            planner = dataclasses.replace(planner, method="receding_horizon")
             found = dataclasses.replace(found, twinning=dataclasses.replace(found.twinning, planner=planner))
         begun = self if self.start != usual.start else dataclasses.replace(self, start=found.start)
         return dataclasses.replace(found, twinning=begun.suited(found.twinning))
@@ -323,3 +386,54 @@ class RunConfig:
             figures_every=0,
             twinning=twinning,
         )
+
+
+@runtime_checkable
+class MakesPlant(Protocol):
+    """A configuration whose options say all that its plant needs."""
+
+    def plant(self) -> Plant:
+        """The real system in simulation, new."""
+        ...
+
+
+def plant_of(config: RunConfig) -> Plant:
+    """The real system in simulation, as the configuration makes it.
+
+    Raises:
+        ValueError: if the configuration has no method ``plant()``.
+    """
+    if not isinstance(config, MakesPlant):
+        raise ValueError(
+            f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one."
+        )
+    return config.plant()
+
+
+def physics_of(config: RunConfig) -> Plant:
+    """The physics of the twin, by which policies and controllers are made: what is believed, or the real system's."""
+    return config.believed() or plant_of(config)
+
+
+def require_plant(argument: str, given: object) -> None:
+    """Refuse what is no plant, such as a class of plants.
+
+    Raises:
+        ValueError: if it is none; the message names the argument.
+    """
+    if not isinstance(given, Plant):
+        raise ValueError(f"{argument}={given!r} must be a plant; if this is a class, give an instance of it.")
+
+
+def require_device(name: str) -> torch.device:
+    """The device of this name.
+
+    Raises:
+        ValueError: if this machine has no such device.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device={name!r} cannot be used on this machine ({error}); use cpu.") from error
+    return device

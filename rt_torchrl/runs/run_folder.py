@@ -1,15 +1,314 @@
-"""The folder of one run, in which one training at a time writes and an earlier run may have left files."""
+"""The folder of a run: its lock, its checkpoints, and its files of tensors, whose damage is noticed."""
 
+import errno
+import hashlib
+import io
 import os
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import filelock
+import numpy as np
+import torch
 
-from rt_torchrl.atomic_file import remove_partials
-from rt_torchrl.runs import checkpoint, run_settings
-from rt_torchrl.runs.results_file import new_folder
+from rt_torchrl.atomic_file import new_folder, remove_partials, write_atomically
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import FILE
+from rt_torchrl.runs.settings import FILE, require_same, write_settings
+
+if TYPE_CHECKING:
+    from rt_torchrl.algorithm import ReinforcementTwinning  # only its type: who reads weights needs no TorchRL
+
+SEAL = b"sha256:"
+"""Beginning of the comment of an archive that holds the checksum of all before it."""
+
+
+class DamagedFileError(ValueError):
+    """A file that is not what a run has written: damaged, foreign, or such that loading it would run code."""
+
+
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors, numbers and strings in dicts, lists and tuples; ``torch.load`` can read the file too.
+
+    The tensors of the file are on the CPU, so that a machine without the device of the run reads it.
+
+    Raises:
+        ValueError: if ``content`` holds anything else; it names the place.
+        OSError: if the file cannot be written, see :func:`write_atomically`.
+    """
+    buffer = io.BytesIO()
+    torch.save(plain(content), buffer)
+    write_atomically(path, _sealed(buffer.getvalue()))
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """The content that :func:`save_tensors` wrote, on the CPU.
+
+    The checksum of the whole file (SHA-256) is compared first, and those of its parts (CRC-32), which files of earlier
+    versions have alone.
+
+    Raises:
+        DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
+            object is not built.
+        OSError: if the file cannot be read, or memory is short, which says nothing of what it holds.
+    """
+    try:
+        return _loaded(path)
+    except (OSError, MemoryError) as error:
+        number = errno.ENOMEM if isinstance(error, MemoryError) else error.errno
+        reason = os.strerror(number) if number else str(error)
+        raise OSError(number, f"{reason}; the file is not read and not changed, try again", str(path)) from error
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    file = path.read_bytes()
+    try:
+        sound = _verified(file)
+    except MemoryError:
+        raise
+    # The kind of error depends on the byte that is wrong, and all of them come from the content of the file.
+    except Exception as error:
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
+    try:
+        content = torch.load(sound, weights_only=True, map_location="cpu")
+    except MemoryError:
+        raise
+    except pickle.UnpicklingError as error:
+        raise DamagedFileError(
+            f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
+            f"in plain containers. {first_line(error)}"
+        ) from error
+    except Exception as error:  # of as many kinds
+        if "allocate memory" in str(error):  # torch has no class of its own for it on the CPU
+            raise MemoryError from error
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
+    if not isinstance(content, dict):
+        raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
+    return content
+
+
+def _sealed(archive: bytes) -> bytes:
+    """The bytes of a zip archive without a comment, with a comment that holds their SHA-256."""
+    seal = SEAL + hashlib.sha256(archive).hexdigest().encode()
+    return archive[:-2] + len(seal).to_bytes(2, "little") + seal
+
+
+def _verified(file: bytes) -> io.BytesIO:
+    """The archive of a file, packed anew from parts whose checksums are right.
+
+    Torch reads fields of an archive that Python does not, such as the flag that makes a part a folder, and gives
+    memory that nobody has written for it. It gets an archive in which these fields are Python's own.
+
+    Raises:
+        zipfile.BadZipFile: if a checksum is wrong, or parts would take more memory than the file has bytes; a run
+            compresses nothing.
+    """
+    length = len(SEAL) + 64
+    end = file[-length:]
+    if end.startswith(SEAL):
+        archive = file[: -length - 2] + b"\0\0"
+        if hashlib.sha256(archive).hexdigest().encode() != end[len(SEAL) :]:
+            raise zipfile.BadZipFile("it does not have the checksum that it was written with")
+    elif file[-2:] != b"\0\0":  # the length of the comment, with which an archive without one ends
+        raise zipfile.BadZipFile("its end is not that of a file of a run")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(file)) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as new:
+        parts = old.infolist()
+        stored = all(part.compress_type == zipfile.ZIP_STORED for part in parts)
+        if not stored or sum(part.file_size for part in parts) > len(file):
+            raise zipfile.BadZipFile(f"its parts are larger than its {len(file)} bytes")
+        if len({part.filename for part in parts}) < len(parts):
+            raise zipfile.BadZipFile("two of its parts have the same name")
+        for part in parts:
+            new.writestr(part.filename, old.read(part))  # which compares the checksum of the part
+    packed.seek(0)
+    return packed
+
+
+def first_line(error: Exception) -> str:
+    """First line of an error's message, without the advice that torch adds after it."""
+    return f"({(str(error).splitlines() or [type(error).__name__])[0]})"
+
+
+def plain(value: Any, place: str = "") -> Any:
+    """The value with only Python's own containers and numbers, and with plain tensors on the CPU.
+
+    Raises:
+        ValueError: if it holds anything but tensors, numbers and strings; it names the place.
+    """
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().as_subclass(torch.Tensor)
+    if isinstance(value, np.generic | float | int | str):
+        return plain(value.item() if isinstance(value, np.generic) else _base(value), place)
+    if isinstance(value, Mapping):
+        return {key: plain(entry, f"{place}[{key!r}]") for key, entry in value.items()}
+    if type(value) in (list, tuple, torch.Size):
+        entries = [plain(entry, f"{place}[{k}]") for k, entry in enumerate(value)]
+        return entries if isinstance(value, list) else tuple(entries)
+    raise ValueError(
+        f"{place or 'content'} of what is to be saved is a {type(value).__name__}; a state_dict may hold tensors, "
+        "numbers and strings, in dicts, lists and tuples."
+    )
+
+
+def _base(value: float | str) -> float | str:
+    """A number or string of a derived class as one of Python's own classes."""
+    return next(kind(value) for kind in (float, int, str) if isinstance(value, kind))
+
+
+CHECKPOINT = "checkpoint.pt"
+"""File of the newest checkpoint in a run folder."""
+FORMAT = 5
+NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
+"""Name of an earlier checkpoint."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a full disk and of a used quota."""
+ANEW = "To train anew in this folder, use --overwrite."
+
+
+def state_of(algorithm: "ReinforcementTwinning") -> dict[str, Any]:
+    """Everything that the next episode depends on: tensors, numbers and strings in dicts, lists and tuples."""
+    return {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()}
+
+
+def restore(algorithm: "ReinforcementTwinning", state: dict[str, Any]) -> None:
+    """Put an algorithm that was built with the same configuration into a saved state.
+
+    Raises:
+        ValueError: if the state belongs to another plant, or does not fit.
+    """
+    name = algorithm.twin.plant.name
+    if state.get("plant") != name:
+        raise ValueError(
+            f"the checkpoint is of plant {state.get('plant')!r}, this training of {name!r}; use its recipe."
+        )
+    try:
+        algorithm.load_state_dict(state["algorithm"])
+    except (KeyError, ValueError) as error:
+        raise ValueError(
+            f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
+            f"with (see its config.json). {type(error).__name__}: {error}"
+        ) from error
+
+
+def save_checkpoint(
+    path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]], *, kept: int = 1
+) -> str | None:
+    """Write a checkpoint; the earlier checkpoint stays intact until the new one is complete.
+
+    Args:
+        path: file of the newest checkpoint. Earlier ones lie beside it, with their number of episodes in their name.
+        algorithm: algorithm to save.
+        episodes: records of the episodes that are done.
+        kept: number of checkpoints that are kept, with the new one.
+
+    Returns:
+        None; or, if the disk is full and earlier checkpoints had to go to make room, a sentence that says so.
+
+    Raises:
+        ValueError: if a component's state, such as an environment's, holds more than tensors, numbers and strings.
+        OSError: if the checkpoint cannot be written.
+    """
+    content = {"format": FORMAT, "episodes": episodes, "state": state_of(algorithm)}
+    if kept > 1 and path.is_file():
+        _keep(path, len(episodes) - 1)
+    try:
+        save_tensors(path, content)
+    except OSError as error:
+        older = earlier(path)
+        if error.errno not in FULL or not older:
+            raise
+        for old in older:
+            old.unlink(missing_ok=True)
+        save_tensors(path, content)
+        return f"the disk of {path.parent} is full; {len(older)} earlier checkpoints went to save the present one"
+    for old in earlier(path)[max(0, kept - 1) :]:
+        old.unlink(missing_ok=True)
+    return None
+
+
+def earlier(path: Path) -> list[Path]:
+    """The checkpoints beside the newest one, latest first."""
+    found = {file: NUMBERED.fullmatch(file.name) for file in path.parent.glob(f"{path.stem}-*{path.suffix}")}
+    numbers = {file: int(match["episodes"]) for file, match in found.items() if match}
+    return sorted(numbers, key=numbers.__getitem__, reverse=True)
+
+
+def has_checkpoint(path: Path) -> bool:
+    """Whether there is a checkpoint to go on from, at ``path`` or an earlier one beside it."""
+    return path.is_file() or bool(earlier(path))
+
+
+def load_checkpoint(path: Path, algorithm: "ReinforcementTwinning") -> list[dict[str, Any]]:
+    """Restore the newest checkpoint that is sound, and return the records of its episodes.
+
+    If that is not the one at ``path``, a line on the terminal says so, and the damaged file is renamed.
+
+    Raises:
+        ValueError: if there is no checkpoint, all of them are damaged, or the newest sound one has another format,
+            belongs to another plant, or does not fit.
+        OSError: if a checkpoint cannot be read, which does not make it a damaged one; nothing is renamed.
+    """
+    candidates = [*([path] if path.is_file() else []), *earlier(path)]
+    if not candidates:
+        raise ValueError(f"there is no checkpoint {path} to go on from.")
+    damaged: dict[Path, DamagedFileError] = {}
+    for file in candidates:
+        try:
+            found = _read(file)
+        except DamagedFileError as error:
+            damaged[file] = error
+            continue
+        try:
+            _restore(file, found, algorithm)
+        except ValueError as error:
+            raise ValueError(f"{error} {ANEW}") from error
+        _set_aside(damaged, file, len(found["episodes"]))
+        return found["episodes"]
+    reasons = " ".join(map(str, damaged.values()))
+    raise ValueError(f"{reasons} {ANEW}") from damaged[candidates[0]]
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """The content of a checkpoint of any format."""
+    found = load_tensors(file)
+    if not {"format", "episodes", "state"} <= found.keys():
+        raise DamagedFileError(
+            f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, found)) or 'nothing'}."
+        )
+    return found
+
+
+def _restore(file: Path, found: dict[str, Any], algorithm: "ReinforcementTwinning") -> None:
+    if found["format"] != FORMAT:
+        raise ValueError(f"{file} has checkpoint format {found['format']}; this version reads format {FORMAT}.")
+    restore(algorithm, found["state"])
+
+
+def _set_aside(damaged: dict[Path, DamagedFileError], sound: Path, episodes: int) -> None:
+    """Say which checkpoint was taken in the place of damaged ones, and keep these under another name."""
+    for file, error in damaged.items():
+        aside = file.with_name(f"{file.name}.damaged")
+        file.replace(aside)
+        print(f"{error} It is now {aside.name}; the training goes on from {sound.name}, after {episodes} episodes.")
+
+
+def _keep(path: Path, episodes: int) -> None:
+    """Keep the newest checkpoint under the name of an earlier one, without a moment in which there is none."""
+    numbered = path.with_name(f"{path.stem}-{episodes:04d}{path.suffix}")
+    numbered.unlink(missing_ok=True)
+    try:
+        os.link(path, numbered)
+    except OSError:
+        if not path.is_file():
+            raise
+        write_atomically(numbered, path.read_bytes())  # a file system without links
+
 
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
@@ -101,8 +400,8 @@ class RunFolder:
     def _require_resumable(self) -> None:
         if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
-        run_settings.require_same(self.path, self._config)
-        if not checkpoint.exists(self.checkpoint) and any((self.path / name).exists() for name in RESULTS):
+        require_same(self.path, self._config)
+        if not has_checkpoint(self.checkpoint) and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(
                 f"log_dir={self.path} holds a finished run without its {self.checkpoint.name}: there is nothing to go "
                 "on with. To train anew in this folder, use --overwrite."
@@ -111,11 +410,11 @@ class RunFolder:
     @property
     def checkpoint(self) -> Path:
         """Path of the newest checkpoint, whether or not it exists yet."""
-        return self.path / checkpoint.NAME
+        return self.path / CHECKPOINT
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        there = checkpoint.exists(self.checkpoint)
+        there = has_checkpoint(self.checkpoint)
         if self._config.resume and not there:
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
         return self._config.resume and there
@@ -139,4 +438,4 @@ class RunFolder:
             for pattern in LEFT:
                 for old in self.path.glob(pattern):
                     old.unlink(missing_ok=True)
-        run_settings.write_settings(self.path, self._config, effective, self._plant)
+        write_settings(self.path, self._config, effective, self._plant)

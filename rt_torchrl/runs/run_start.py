@@ -1,6 +1,5 @@
-"""What a run begins with: the sources that its option ``start`` names, read and checked before any work."""
+"""What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,20 +8,22 @@ from typing import Any
 import torch
 from torch import nn
 
+from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.evaluation.unseen import Baseline, RealController
 from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs import checkpoint
-from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.run_config import STARTS, RunConfig
+from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
+from rt_torchrl.runs.run_folder import CHECKPOINT, has_checkpoint
 from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
+from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -49,7 +50,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start
-    begun = config.resume and config.log_dir is not None and checkpoint.exists(config.log_dir / checkpoint.NAME)
+    begun = config.resume and config.log_dir is not None and has_checkpoint(config.log_dir / CHECKPOINT)
     if begun or name == "random":
         return lambda physics, closure: None
     if name == "controller":
@@ -58,8 +59,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         law = controller(plant)
         return lambda physics, closure: FirstController(law.to(_device_of(physics, closure)))
     if name == "mpc":
-        # No critic has learned anything yet that could price the end of a window.
-        options = dataclasses.replace(config.twinning.planner.receding_horizon, terminal="plant")
+        options = config.twinning.planner.receding_horizon
         return lambda physics, closure: FirstController(PredictiveControl(physics, closure, options))
     path = Path(name)
     if path.is_dir():
@@ -139,7 +139,7 @@ def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant)
             return None
         raise ValueError(
             f"start={str(folder)!r} is a run that believes {its.hypothesis!r}, but {error} Give the "
-            "--twinning.hypotheses.names of that run, or --twinning.hypotheses.which none to plan on the twin alone."
+            "--twinning.hypotheses.which of that run, or --twinning.hypotheses.which none to plan on the twin alone."
         ) from error
     return found
 
@@ -180,3 +180,106 @@ def on(device: torch.device, record: Trajectory) -> Trajectory:
 def _device_of(*modules: nn.Module) -> torch.device:
     parts = (part for module in modules for part in (*module.parameters(), *module.buffers()))
     return next((part.device for part in parts), torch.device("cpu"))
+
+
+CHECKED_STEPS = 10
+"""Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
+
+
+def known_physics(
+    config: RunConfig,
+    plant: Plant,
+    believed: Plant | None,
+    real: RealSystem | None,
+    first: type[ClassicalController] | None,
+    baselines: dict[str, type[Baseline]] | None,
+) -> Plant:
+    """The physics of the twin, where all that a run is given fits; the arguments are those of :class:`Run`.
+
+    Raises:
+        PlantContractError: if a plant breaks its contract.
+        ValueError: if options, controllers, the twin's physics and the real system do not go together.
+    """
+    require_simulation(config, plant, real, baselines)
+    physics = require_physics(plant, believed)
+    for one in filter(None, (plant, believed)):
+        check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
+    require_controllers(physics, first, baselines)
+    return physics
+
+
+def require_simulation(
+    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
+) -> None:
+    """Refuse options that only a plant in simulation can carry out, and controllers that need the other kind of system.
+
+    Raises:
+        ValueError: if there is such an option or controller; it names it.
+    """
+    if env is not None and (config.noise or config.wear(plant) is not None):
+        raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
+    if env is None and config.real_unseen:
+        raise ValueError(
+            f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
+            "its own; leave it out, and unseen says how many episodes are simulated."
+        )
+    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
+    on_the_plant = [name for name in baselines or {} if name not in real]
+    if real and (env is None or env.closure is not None):
+        raise ValueError(
+            f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
+            "Give ClassicalController classes, or a RealSystem without its closure."
+        )
+    if real and not config.real_unseen:
+        raise ValueError(
+            f"baselines {real} can only be flown on the real system, which flies nothing after the training with "
+            "real_unseen=0; say how many episodes each may fly, such as real_unseen=5, or leave them out."
+        )
+    if env is not None and env.closure is None and (config.reference or on_the_plant):
+        raise ValueError(
+            f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
+            "and the real system's is not known; leave them out, or give the RealSystem its closure."
+        )
+
+
+def _acts_on_the_real_system(law: object) -> bool:
+    return isinstance(law, type) and issubclass(law, RealController)
+
+
+def require_controllers(
+    physics: Plant, first: type[ClassicalController] | None, baselines: dict[str, type[Baseline]] | None
+) -> None:
+    """Refuse controllers that are no classes, or whose laws do not fit the plant.
+
+    Raises:
+        ValueError: if there is one; the message names it, and says what is expected.
+    """
+    given: dict[str, object] = {} if first is None else {"first": first}
+    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
+    for name, law in given.items():
+        if not _acts_on_the_real_system(law):
+            require_controller(name, law, physics)
+
+
+def require_physics(plant: Plant, believed: Plant | None) -> Plant:
+    """The physics of the twin of a real system.
+
+    Args:
+        plant: the real system.
+        believed: physics that the twin is given; None for those of the real system.
+
+    Raises:
+        ValueError: if one is no plant, or the twin has states that no sensor of the real system reads, or lacks some
+            that one reads.
+    """
+    require_plant("plant", plant)
+    if believed is not None:
+        require_plant("believed", believed)
+    physics = believed or plant
+    known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
+    if known != read:
+        raise ValueError(
+            f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
+            f"{', '.join(read)}, which is all that sensors read; give believed, the plant without its extensions."
+        )
+    return physics

@@ -1,12 +1,19 @@
-"""The file ``config.json`` of a run folder: the options of the run, its plant, and the recipe that made it."""
+"""The file ``config.json`` of a run folder: the options of a run, its plant, and the recipe that made it."""
 
 import dataclasses
+import functools
 import importlib
+import importlib.metadata
+import importlib.util
 import itertools
 import json
+import platform
+import shlex
 import sys
+import time
 import typing
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -15,8 +22,8 @@ from typing import Any, Literal
 
 import cattrs
 
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
 
 FILE = "config.json"
 RAN = "ran"
@@ -209,3 +216,173 @@ def _message(error: BaseException, kind: type | None) -> str:
         unknown = ", ".join(sorted(error.extra_fields))
         return f"{error.cl.__name__} has no option {unknown}; it is of another version or recipe."
     return f"option {error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
+HARMLESS = {
+    *("episodes", "patience", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
+    *("real_unseen", "checkpoints", "loggers"),
+    # These change a result by rounding alone.
+    *("threads", "compiled"),
+    *("config", "log_dir", "resume", "overwrite"),
+}
+"""Options that may differ when a run is resumed: those of its length, its reports and its speed."""
+ABSENT = "nothing"
+
+
+def write_settings(folder: Path, asked: RunConfig, effective: RunConfig, plant: str) -> None:
+    """Write ``config.json``: the settings of the run, and ``ran`` with an entry for every start of the run.
+
+    Args:
+        folder: run folder.
+        asked: options as they were asked for.
+        effective: options that the run carries out.
+        plant: name of the plant.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    before = read_settings(folder).get(RAN, []) if asked.resume else []
+    ran = {
+        "effective": as_written(effective),
+        "versions": versions(),
+        "command": shlex.join(sys.argv),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    settings = settings_of(asked, plant) | {RAN: [*before, ran]}
+    # Options may be infinite; JSON as Python writes it keeps them as they are.
+    write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python, this library and the libraries it computes with; None for one that is not a package."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in VERSIONS_OF:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def as_written(config: RunConfig) -> dict[str, Any]:
+    """The options as JSON gives them back."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+
+
+def require_same(folder: Path, asked: RunConfig) -> None:
+    """Refuse to go on with a run under options that differ from its own, except for harmless ones.
+
+    ``unseen`` is harmless too if the run has not judged any training episode on the unseen episodes.
+
+    Raises:
+        ValueError: if an option differs; it names each such option with both values.
+    """
+    judged = flat(read_settings(folder)).get("unseen_every")
+    if found := differences(folder, asked, HARMLESS if judged else HARMLESS | {"unseen"}):
+        raise ValueError(
+            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(found)}. Give the run's "
+            "own options, or another folder for a new run."
+        )
+
+
+def differences(folder: Path, asked: RunConfig, harmless: AbstractSet[str] = HARMLESS) -> list[str]:
+    """What differs between the options of a run and those that are asked for, in words.
+
+    Args:
+        folder: run folder.
+        asked: options as they are asked for.
+        harmless: options that may differ.
+
+    Raises:
+        ValueError: if the folder is not a run folder, or its settings are damaged.
+    """
+    its = flat(read_settings(folder))
+    asks = flat(as_written(asked))
+    defaults = flat(as_written(type(asked)()))
+    found = []
+    for name in sorted(its.keys() | asks.keys()):
+        if name.split(".")[0] in {*harmless, *BESIDE}:
+            continue
+        # A run of an earlier version had, for an option that is new since then, the value that is now its default.
+        was, now = its.get(name, defaults.get(name, ABSENT)), asks.get(name, ABSENT)
+        if was != now:
+            found.append(f"{name} is {now} here and was {was} in the run")
+    return found
+
+
+def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options by their dotted names, as the command line has them."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict) and value:
+            found |= flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+PREFIX = "rt_torchrl_recipe_"
+"""Prefix of the names under which files are imported."""
+
+
+def module_of(file: Path) -> ModuleType:
+    """The module in a file, imported only once; as a script does, it can import modules that lie beside the file.
+
+    Raises:
+        ValueError: if there is no such file, or it does not end in ``.py``.
+    """
+    if not file.is_file():
+        raise ValueError(f"{file} does not exist; give a file with Python code.")
+    return _imported(file.resolve())
+
+
+@functools.cache
+def _imported(file: Path) -> ModuleType:
+    if str(file.parent) not in sys.path:
+        sys.path.insert(0, str(file.parent))
+    name = f"{PREFIX}{file.stem}"
+    while name in sys.modules:  # a file of the same name in another folder
+        name += "_"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{file} is no Python code, by its name; give a file that ends in .py.")
+    # Known by its name, because the command line looks up the source of its options for their help.
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def named(target: str) -> Any:
+    """The object that ``FILE.py:NAME`` or ``package.module:NAME`` names.
+
+    Raises:
+        ValueError: if there is no such file or module, or it does not define the name.
+    """
+    place, colon, name = target.rpartition(":")
+    if not (colon and place and name):
+        raise ValueError(f"{target!r} is not understood; write FILE.py:NAME or package.module:NAME.")
+    if place.endswith(".py"):
+        return attribute(module_of(Path(place)), name)
+    try:
+        return attribute(importlib.import_module(place), name)
+    except ImportError as error:
+        raise ValueError(
+            f"{target!r} cannot be imported ({error}); install its package, or give its file as FILE.py:{name}."
+        ) from error
+
+
+def attribute(module: ModuleType, name: str) -> Any:
+    """The object that a module defines under a name, which may have dots.
+
+    Raises:
+        ValueError: if the module does not define the name.
+    """
+    try:
+        return functools.reduce(getattr, name.split("."), module)
+    except AttributeError as error:
+        raise ValueError(f"{module.__file__ or module.__name__} defines no {name}.") from error

@@ -33,7 +33,7 @@ from rt_torchrl.fit.sensors import (
     with_biases,
 )
 from rt_torchrl.fit.uncertainty import Uncertainty
-from rt_torchrl.optimisers.descent import Descended, Descent
+from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
@@ -73,7 +73,8 @@ class Assimilation:
                 f"an episode of plant {twin.plant.name!r}; 0 replays whole records."
             )
         self.twin, self.config = twin, config
-        self.descent = Descent(twin.closure, config.descent)
+        lbfgs = DescentConfig(optimiser="lbfgs", rate=1.0)
+        self.descent = Descent(twin.closure, lbfgs if config.method == "lbfgs" else DescentConfig())
         self.damping = DAMPING
         """Damping μ with which the next fit by Levenberg-Marquardt begins."""
         sensors = state_sensors(twin.plant)

@@ -1,6 +1,5 @@
 """Hyper-parameters of the six steps."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -8,38 +7,17 @@ from typing import Literal
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, require_widths
+from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 
 Role = Literal["model_free", "model_based"]
 Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 RefereeName = Literal["decision_tree", "expected_cost"]
 LargeScale = Literal["met", "mixed"]
+EXPERIENCE = 100
+"""Number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; the paper has 1."""
 LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class LongTermMemoryConfig:
-    """Parameters of the long-term memory D_L.
-
-    Args:
-        capacity: number n_L of transitions that the memory keeps.
-        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
-        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
-    """
-
-    capacity: int = 100_000
-    prioritisation: float = 0.6
-    correction: float = 0.4
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.capacity < 1:
-            raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
-        for argument in ("prioritisation", "correction"):
-            if not 0.0 <= getattr(self, argument) <= 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must lie in [0, 1].")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +26,8 @@ class LearnerConfig:
 
     Args:
         algorithm: model-free method, a loss of TorchRL: ``ddpg``; ``relaxed_ddpg``, DDPG as the paper prints it, whose
-            critic is its own target and takes the share τ of every step; ``td3``, which takes the lower value of two
+            critic is its own target and takes the share τ of every step, without importance weights and a limit of the
+            policy's gradient; ``td3``, which takes the lower value of two
             critics, delays the policy and smooths the targets; or one that also prices the entropy of a policy with
             noise: ``sac``, ``crossq`` (normalised layers instead of targets) or ``redq`` (more critics).
         critic_iterations: number n_Q of critic iterations per episode.
@@ -64,9 +43,8 @@ class LearnerConfig:
         target_rate: rate τ at which the targets follow, or share of its step that a relaxed critic takes.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
-        gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
         critic_hidden: widths of the critic's hidden layers.
-        memory: parameters of the long-term memory D_L.
+        memory_capacity: number n_L of transitions that the long-term memory D_L keeps.
     """
 
     algorithm: LearnerName = "ddpg"
@@ -79,22 +57,21 @@ class LearnerConfig:
     target_rate: float = 0.01
     critic_rate: float = 1e-3
     actor_rate: float = 2e-3
-    gradient_limit: float = 1.0
     critic_hidden: Sequence[int] = field(default=(64, 64))
-    memory: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
+    memory_capacity: int = 100_000
 
     def __post_init__(self) -> None:
-        check_options(self, infinite=("gradient_limit",))
+        check_options(self)
         require_widths("critic_hidden", self.critic_hidden)
         for argument in ("critic_iterations", "actor_iterations"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        for argument in ("batch_size", "return_steps"):
+        for argument in ("batch_size", "return_steps", "memory_capacity"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 <= self.discount < 1.0:
             raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
-        for argument in ("reward_scale", "target_rate", "critic_rate", "actor_rate", "gradient_limit"):
+        for argument in ("reward_scale", "target_rate", "critic_rate", "actor_rate"):
             if not getattr(self, argument) > 0.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
 
@@ -157,109 +134,57 @@ class ConstraintsConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShortHorizonConfig:
-    """Parameters of the planning over short windows.
-
-    Args:
-        window: number of control intervals in a window; 0 plans over whole episodes instead, as in the paper.
-        discount: discount factor γ per control interval.
-        critic_iterations: gradients of the critic for each window.
-        policy_rate: learning rate of the policy (Adam).
-    """
-
-    window: int = 0
-    discount: float = 0.98
-    critic_iterations: int = 8
-    policy_rate: float = 5e-3
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument, least in (("window", 0), ("critic_iterations", 1)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
-        if not 0.0 <= self.discount < 1.0:
-            raise ValueError(f"discount={self.discount} of the short horizon must lie in [0, 1).")
-        if not self.policy_rate > 0.0:
-            raise ValueError(f"policy_rate={self.policy_rate} of the short horizon must be positive.")
-
-
-@dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
     """Parameters of step 5.
 
     Args:
-        method: method of the model-based policy: whole_episodes descends the cost of whole virtual episodes,
-            short_horizon that of short windows plus a learned tail cost, and receding_horizon is model predictive
-            control, which has no weights of its own and plans while it acts. By default short_horizon if its window is
-            positive, and else whole_episodes.
+        method: method of the model-based policy. ``multi_start`` descends the cost of whole virtual episodes from
+            several starts and compares the plans (:class:`MultiStart`). ``single_start`` does what the paper does: it
+            descends from the present weights, in virtual episodes that begin as the last real one did under draws of
+            its input, and keeps every plan. ``short_horizon`` descends the cost of short windows plus a learned tail
+            cost. ``receding_horizon`` is model predictive control, which has no weights of its own and plans while it
+            acts.
         iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
             episodes.
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
-        initial: where the virtual episodes of a plan begin: ``drawn`` for random initial states of the plant, or
-            ``record`` for that of the last real episode, as in the paper.
-        starts: number of random policies, the best of which is a start of plans over whole episodes
-            (:class:`MultiStart`); 0 plans from the present weights alone, as in the paper.
-        accepts: plans that stay: those that are ``better`` on other virtual episodes than the policy before, or
-            ``every`` one, as in the paper, which begins with the present weights.
-        episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
-            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
-            infinite for none, as in the paper.
-        experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
-        extremes: number of random initial states among which the extremes of each state are found, from which a plan
-            and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
-            of hundreds.
+        starts: number of random policies, the best of which is a start of ``multi_start``; 0 plans from the present
+            weights alone.
         constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
-        short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
-            use.
+        window: number of control intervals in a window of ``short_horizon``.
         receding_horizon: parameters of model predictive control.
     """
 
-    method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
+    method: Literal["multi_start", "single_start", "short_horizon", "receding_horizon"] = "multi_start"
     iterations: int = 10
     realisations: int | None = None
-    initial: Literal["drawn", "record"] = "drawn"
     starts: int = 32
-    accepts: Literal["better", "every"] = "better"
-    episode_gradient_limit: float = 10.0
-    experience: int = 100
-    extremes: int = 1000
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
-    short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
+    window: int = 25
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     @property
     def whole(self) -> bool:
         """Whether plans descend over whole episodes."""
-        return not self.short_horizon.window and self.method != "receding_horizon"
+        return self.method in ("multi_start", "single_start")
 
     def __post_init__(self) -> None:
-        check_options(self, infinite=("episode_gradient_limit",))
-        if self.method is not None and (self.method == "short_horizon") != (self.short_horizon.window > 0):
-            raise ValueError(
-                f"method={self.method!r} of the planning does not go with short_horizon.window="
-                f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
-            )
+        check_options(self)
         if self.constraints.states and not self.whole:
             raise ValueError(
                 f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
-                "planner.method and short_horizon.window as they are, or leave the constraints out."
+                "planner.method as it is, or leave the constraints out."
             )
-        for argument, least in (("iterations", 0), ("starts", 0), ("extremes", 0), ("experience", 1)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the planning must be at least {least}.")
-        if self.accepts == "every" and self.starts:
-            raise ValueError(f"accepts='every' plan needs starts=0, not {self.starts}: what is kept is not compared.")
+        for argument in ("iterations", "starts"):
+            if getattr(self, argument) < 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the planning must not be negative.")
+        if self.window < 1:
+            raise ValueError(f"window={self.window} of the planning must be at least 1 control interval.")
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
-        if not self.episode_gradient_limit >= 1.0:
-            raise ValueError(
-                f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
-                "no limit."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,15 +199,12 @@ class RefereeConfig:
         patience: number P_π of episodes in a row that a reason to swap must outlast, in the decision tree.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.
-        tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse,
-            in the decision tree.
         stall: relative weight change T_w below which the idle policy has stalled.
     """
 
     rule: RefereeName = "expected_cost"
     patience: int = 2
     clone_patience: int = 3
-    tolerance: float = 1.0
     stall: float = 0.5
 
     def __post_init__(self) -> None:
@@ -290,9 +212,8 @@ class RefereeConfig:
         for argument in ("patience", "clone_patience"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        for argument in ("tolerance", "stall"):
-            if not getattr(self, argument) > 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+        if not self.stall > 0:
+            raise ValueError(f"stall={self.stall} must be positive.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,8 +226,9 @@ class AssimilationConfig:
         inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
             paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
             it also does not find weights that move the states less than that chance does.
-        method: method of the fit: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the
-            normal equations from forward sensitivities, for closures of some ten weights, and does not use ``descent``.
+        method: method of the fit: ``adam`` with a rate of 0.1, ``lbfgs`` with a line search, or
+            ``levenberg_marquardt``, which solves the normal equations from forward sensitivities, for closures of some
+            ten weights.
         starts: number of first weights in every episode: the present ones, those of the first closure, and then these
             two in turns, moved at random. The best fit stays, as a law that has bent to one record may be in a local
             minimum of the next ones. More than 1 needs ``levenberg_marquardt`` and ``initial="measured"``.
@@ -328,20 +250,18 @@ class AssimilationConfig:
             the mean square of the residuals in units of the noise, and ``stop_below`` has no effect. Sensors need
             ``levenberg_marquardt``, the inputs of the ``record`` and ``initial="estimated"``.
         biased: names of the sensors that may be off by a constant, which is estimated.
-        descent: parameters of the closure's descent.
     """
 
     iterations: int = 15
     stop_below: float = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
-    method: Literal["gradient", "levenberg_marquardt"] = "gradient"
+    method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "adam"
     starts: int = 1
     prior: float = 0.0
     segment: int | None = None
     initial: Literal["measured", "estimated"] = "measured"
     sensors: tuple[str, ...] = ()
     biased: tuple[str, ...] = ()
-    descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -379,27 +299,25 @@ class HypothesesConfig:
     """Parameters of the hypotheses.
 
     Args:
-        which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), or ``none`` for the twin alone.
+        which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), ``none`` for the twin alone, or names
+            of suspects, also of those that are taken only by name (:meth:`Plant.further_suspects`).
         call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
             which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
             always.
-        names: names of the suspects that are taken, also of those that are taken only by name
-            (:meth:`Plant.further_suspects`); all of the others if there are none.
 
     Raises:
         ValueError: if an argument is out of its range.
     """
 
-    which: Literal["none", "automatic"] = "automatic"
+    which: tuple[str, ...] = ("automatic",)
     call: float = 0.05
-    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_options(self)
         if not self.call >= 0.0:
             raise ValueError(f"call={self.call} of the hypotheses must not be negative.")
-        if self.names and self.which == "none":
-            raise ValueError(f"names={self.names} of the hypotheses need which='automatic'; it is 'none'.")
+        if not self.which or (len(self.which) > 1 and {"automatic", "none"} & set(self.which)):
+            raise ValueError(f"which={self.which} of the hypotheses must be automatic, none, or names of suspects.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -413,8 +331,6 @@ class TwinningConfig:
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
-        least_sound: least share of a real episode without a fault, in a row, that is learned from; with a lower share
-            the episode is flown again.
         limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
             to be kept before a policy may act.
         exploration: parameters of step 1.
@@ -430,7 +346,6 @@ class TwinningConfig:
     realisations: int = 5
     records: int = 1
     virtual_episodes: int = 20
-    least_sound: float = 0.5
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -443,7 +358,7 @@ class TwinningConfig:
     @property
     def experience(self) -> int:
         """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
-        return max(self.records, self.planner.experience)
+        return max(self.records, 1 if self.planner.method == "single_start" else EXPERIENCE)
 
     @property
     def bounded_states(self) -> dict[str, tuple[float, float]]:
@@ -455,23 +370,14 @@ class TwinningConfig:
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
-        if not 0.0 < self.least_sound <= 1.0:
-            raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")
 
 
 PAPER = TwinningConfig(
-    learner=LearnerConfig(
-        algorithm="relaxed_ddpg",
-        target_rate=0.02,
-        gradient_limit=math.inf,
-        memory=LongTermMemoryConfig(correction=0.0),
-    ),
+    learner=LearnerConfig(algorithm="relaxed_ddpg", target_rate=0.02),
     assimilation=AssimilationConfig(segment=0),
-    planner=PlannerConfig(
-        initial="record", starts=0, accepts="every", episode_gradient_limit=math.inf, experience=1, extremes=0
-    ),
+    planner=PlannerConfig(method="single_start"),
     referee=RefereeConfig(rule="decision_tree"),
-    hypotheses=HypothesesConfig(which="none"),
+    hypotheses=HypothesesConfig(which=("none",)),
 )
 """The paper's algorithm, with the numbers of its first test case (Table 1, row T1). Of what the paper does not print,
 τ is 0.02, with which the critic stays finite, and optimisers, their rates and the exploration are the library's."""

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.report import findings
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operation import Operation
+from rt_torchrl.systems.operation.operator import Operation
 from rt_torchrl.systems.sound_part import (
     SHORTEST,
     EpisodeEndedError,
@@ -46,6 +46,8 @@ class ShortTermMemory(deque[Trajectory]):
         self.extend(Trajectory(**record) for record in state["records"])
 
 
+LEAST_SOUND = 0.5
+"""Least share of a real episode in one sound part, below which it is flown again."""
 FLIGHTS = 3
 """Number of real episodes in a row without a sound part after which somebody has to look at the machine."""
 
@@ -154,7 +156,6 @@ class RealFlights:
         actor: what acts in the rollout.
         rollout: function that flies one episode of batch size 1.
         plant: plant that gives the length of an episode.
-        least_sound: least share of an episode in one sound part, below which it is flown again.
     """
 
     def __init__(
@@ -163,10 +164,9 @@ class RealFlights:
         actor: LivePolicy,
         rollout: Callable[[], TensorDict],
         plant: Plant,
-        least_sound: float,
     ):
         self.env, self.actor, self.rollout, self.plant = env, actor, rollout, plant
-        self._least = max(SHORTEST, least_sound * plant.n_steps)
+        self._least = max(SHORTEST, LEAST_SOUND * plant.n_steps)
         self.faults: list[Fault] = []
         """Faults of the system in the episodes since :meth:`begin`."""
         self.latest: Flight | None = None

@@ -233,6 +233,9 @@ def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "s
     return (vectors * scale.unsqueeze(-2)) @ vectors.mH
 
 
+EXTREMES = 1000
+"""Number of random initial states among which the extreme ones are found: twenty virtual episodes do not show what a
+policy does in one of hundreds."""
 EXTREMES_SEED = 3_000_000
 """Seed of the initial states among which the extreme ones are found: the same for every training."""
 RARE, FAILURE = 0.01, 10.0

@@ -14,10 +14,9 @@ from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
 from rt_torchrl.steps.flight import Flight, RealFlights, ShortTermMemory, flown, together
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import Step, as_findings, findings, merged, plain
-from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
-from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
-from rt_torchrl.systems.operation.operation import Operation
-from rt_torchrl.systems.operation.order import FIRST, Order
+from rt_torchrl.systems.config import OperatingLimitsConfig
+from rt_torchrl.systems.operation.operator import FIRST, Operation, Order
+from rt_torchrl.systems.safety import OperatingLimits, require_layer
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory

@@ -10,6 +10,7 @@ to the bit, without the time that it takes to find out what to compute.
 import contextlib
 import copy
 import functools
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
@@ -34,9 +35,9 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import LearnerConfig, LongTermMemoryConfig
+from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
-from rt_torchrl.systems.refusal import finite_errors, finite_transitions
+from rt_torchrl.systems.sound_part import finite_errors, finite_transitions
 
 
 @runtime_checkable
@@ -90,6 +91,8 @@ class LearningMethod(NamedTuple):
         normalised: whether the layers of the critics are normalised over a batch.
         relaxed: whether a critic without targets takes only the share τ of each of its steps.
         draws: whether the loss draws random numbers.
+        gradient_limit: greatest norm of the policy's gradient.
+        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
     """
 
     make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
@@ -100,6 +103,8 @@ class LearningMethod(NamedTuple):
     normalised: bool = False
     relaxed: bool = False
     draws: bool = True
+    gradient_limit: float = 1.0
+    correction: float = 0.4
 
 
 def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, target: bool = True) -> LossModule:
@@ -127,7 +132,14 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
 
 METHODS: dict[str, LearningMethod] = {
     "ddpg": LearningMethod(ddpg_loss, delay=0, draws=False),
-    "relaxed_ddpg": LearningMethod(functools.partial(ddpg_loss, target=False), delay=0, relaxed=True, draws=False),
+    "relaxed_ddpg": LearningMethod(
+        functools.partial(ddpg_loss, target=False),
+        delay=0,
+        relaxed=True,
+        draws=False,
+        gradient_limit=math.inf,
+        correction=0.0,
+    ),
     "td3": LearningMethod(td3_loss, critics=2, delay=2),
     "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
     "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
@@ -220,8 +232,8 @@ class ActorCritic:
         config: parameters of step 2.
         generator: source of the critics' initial weights and of the samples.
         method: the method, for a loss of one's own; by default the one that ``config.algorithm`` names.
-        replay: function of ``config.memory`` and ``generator=`` that makes the memory, with the methods of
-            :class:`LongTermMemory`.
+        replay: function of ``config.memory_capacity``, ``correction=`` of the method and ``generator=`` that makes the
+            memory, with the methods of :class:`LongTermMemory`.
 
     Raises:
         ValueError: if ``return_steps`` exceeds an episode of the plant.
@@ -245,7 +257,8 @@ class ActorCritic:
         self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
         self.method = method or METHODS[config.algorithm]
         self.batch_size = min(config.batch_size, plant.n_steps)
-        self.memory = (replay or LongTermMemory)(config.memory, generator=generator)
+        correction = self.method.correction
+        self.memory = (replay or LongTermMemory)(config.memory_capacity, correction=correction, generator=generator)
         stochastic, n_a = self.method.stochastic, len(plant.actions)
         self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
         widths = (len(plant.observations) + n_a, *config.critic_hidden)
@@ -402,29 +415,6 @@ class ActorCritic:
             self._iterations[name] = Iteration(self, kind, keys)
         return self._iterations[name]
 
-    def cost_to_go(self, observation: Float[Tensor, "n n_o"]) -> Float[Tensor, " n"]:
-        r"""What the policy costs from observations on, :math:`-q(e, \pi(e))` for the rewards without their scale.
-
-        With several critics it is that of the lowest value, as in the targets. It is differentiable by the observation.
-        """
-        values = self.values(observation, self.actor.scaled(self.policy(observation)))
-        return -values.amin(0).squeeze(-1) / self.config.reward_scale
-
-    def values(
-        self, observation: Float[Tensor, "n n_o"], action: Float[Tensor, "n n_a"], *, target: bool = False
-    ) -> Float[Tensor, "critics n 1"]:
-        """The values of all critics, or of their targets, for scaled actions."""
-        pairs = TensorDict({"observation": observation, "action": action}, batch_size=len(observation))
-        name = "qvalue_network" if hasattr(self.loss, "qvalue_network_params") else "value_network"
-        network, weights = getattr(self.loss, name), getattr(self.loss, f"{'target_' * target}{name}_params")
-        values = list[Tensor]()
-        network.eval()
-        for of_one in weights.unbind(0) if weights.batch_size else [weights]:
-            with of_one.to_module(network):
-                values.append(network(pairs.copy())["state_action_value"])
-        network.train()
-        return torch.stack(values)
-
     def observations(self) -> Float[Tensor, "n n_o"]:
         """See :meth:`Learner.observations`."""
         return self.memory.observations().to(self.generator.device)
@@ -559,7 +549,7 @@ class Iteration:
             loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
             gradients = slopes(loss, learner.actor_adam.weights)
             norm = norm_of(gradients)
-            share = (learner.config.gradient_limit / (norm + TINY)).clamp(max=1.0)
+            share = (learner.method.gradient_limit / (norm + TINY)).clamp(max=1.0)
             results += [-losses["loss_actor"].detach(), norm]
             steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
         relaxed = learner.critic_adam.weights if self.critic and learner.method.relaxed else []
@@ -652,27 +642,31 @@ class LongTermMemory:
     It stands on the CPU.
 
     Args:
-        config: parameters of D_L.
+        capacity: number n_L of transitions that the memory keeps.
+        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
+        correction: exponent of the importance weights.
         generator: source of the samples.
     """
 
-    def __init__(self, config: LongTermMemoryConfig, *, generator: torch.Generator):
-        self._config, self._generator = config, generator
+    def __init__(
+        self, capacity: int, *, prioritisation: float = 0.6, correction: float = 0.4, generator: torch.Generator
+    ):
+        self.capacity, self.prioritisation, self.correction = capacity, prioritisation, correction
+        self._generator = generator
         if generator.device.type != "cpu":
             seed = torch.randint(2**62, (), generator=generator, device=generator.device)
             self._generator = torch.Generator(device="cpu").manual_seed(int(seed))
         self._clear()
 
     def _clear(self) -> None:
-        config = self._config
-        self._writer = LeastPriorityWriter(config.capacity)
+        self._writer = LeastPriorityWriter(self.capacity)
         # It takes priorities as they are, because a power is rounded by the place of its number in the memory, and a
         # training that goes on from a saved state has to sample the same.
         self.buffer = TensorDictPrioritizedReplayBuffer(
             alpha=1.0,
-            beta=config.correction,
+            beta=self.correction,
             eps=0.0,
-            storage=LazyTensorStorage(config.capacity, device="cpu"),
+            storage=LazyTensorStorage(self.capacity, device="cpu"),
             sampler_device="cpu",
         )
         self.buffer.set_writer(self._writer)
@@ -703,7 +697,7 @@ class LongTermMemory:
         errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
         if not errors.isfinite().all():
             raise FloatingPointError("a TD error exceeds the range of single precision")
-        self._prioritise(index.cpu(), (errors + TOL) ** self._config.prioritisation)
+        self._prioritise(index.cpu(), (errors + TOL) ** self.prioritisation)
 
     def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
         self._writer.priorities[index.numpy()] = priorities.numpy()
@@ -729,7 +723,7 @@ class LongTermMemory:
 
 
 MakeReplay = Callable[..., LongTermMemory]
-"""Function of a :class:`LongTermMemoryConfig` and ``generator=`` that makes a memory."""
+"""Function of the capacity, ``correction=`` and ``generator=`` that makes a :class:`LongTermMemory`."""
 
 
 class LeastPriorityWriter(Writer):

@@ -25,6 +25,9 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 Weights = dict[str, Tensor]
 SEVERAL = (1, 2, 4)
 """Episodes in which plans have several starts; later ones gained nothing on eight systems."""
+GRADIENT_LIMIT = 10.0
+"""Limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second descent over whole episodes
+where the first one gains nothing beside a mean gradient that is longer."""
 STRIDE = 1_000_003
 """Difference of the seeds of the random policies of two episodes."""
 SEEDS = 2**63
@@ -83,24 +86,23 @@ class WholeEpisodes:
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
-        limit = self.config.episode_gradient_limit
         found = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
         if self._stalled(found.start, found.best, found.gradient):
-            again = self.descent.run(lambda: self._cost(episodes, limit), self.config.iterations)
+            again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
             found = found._replace(best=again.best, iterations=found.iterations + again.iterations)
         return found
 
     def stalled(self, plan: TensorDict) -> bool:
         """Whether the plan of a report gained nothing, or was none, although its first gradient exceeds the limit."""
-        if math.isinf(self.config.episode_gradient_limit):
-            return False
         if "policy_gradient" not in plan:
             return True
         return self._stalled(*(plan[key].item() for key in ("J_a_plan_before", "J_a_plan", "policy_gradient")))
 
     def _stalled(self, before: float, after: float, gradient: float) -> bool:
+        if self.config.method == "single_start":
+            return False
         weights = [w.detach() for w in self.policy.parameters() if w.requires_grad]
-        return stuck(before, after, gradient, weights, self.config.episode_gradient_limit)
+        return stuck(before, after, gradient, weights, GRADIENT_LIMIT)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
@@ -183,7 +185,7 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
         if config.method == "receding_horizon":
             return RecedingHorizonPlanner(twin, policy, config)
     elif config.method != "receding_horizon":
-        if config.short_horizon.window:
+        if config.method == "short_horizon":
             return ShortHorizon(twin, policy, config, generator=generator)
         return WholeEpisodes(twin, policy, config)
     raise ValueError(
@@ -218,7 +220,7 @@ class MultiStart:
     expected to cost least. Where the twin is wrong, what has flown stays as it is if it is expected to cost less than
     every plan.
 
-    Note: the paper keeps every plan, as ``accepts="every"`` does. Here a plan made on N_z winds is compared with the
+    Note: the paper keeps every plan, as ``single_start`` does. Here a plan made on N_z winds is compared with the
     previous policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another
     wind. State feedback plans while it acts, so that there is nothing to compare.
 
@@ -245,9 +247,9 @@ class MultiStart:
     ):
         self.planner, self.belief, self.virtual = planner, belief, belief.virtual
         fed_back = isinstance(planner.policy, StateFeedback)
-        self.judges = config.accepts == "better" and not fed_back
+        self.judges = config.method != "single_start" and not fed_back
         """Whether plans are compared; else every one is kept."""
-        self.count = config.starts if config.whole and not fed_back else 0
+        self.count = config.starts if config.method == "multi_start" and not fed_back else 0
         self.make_policy = make_policy or self.virtual.twin.plant.make_policy
         self._first: Weights | None = None
         self._stalled = 0

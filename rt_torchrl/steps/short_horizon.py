@@ -54,24 +54,21 @@ class ShortHorizon:
         ValueError: if a window is longer than an episode.
     """
 
-    gradient_limit = 1.0
+    discount, policy_rate, gradient_limit = 0.98, 5e-3, 1.0
     moments = (0.7, 0.95)  # Adam's decay rates, which are short because the cost changes with every window
     mixing = 0.95
     """Weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ."""
     critic_hidden: Sequence[int] = (64, 64)
-    critic_rate, target_rate = 2e-3, 0.2
-    """Learning rate of the critic, and the share of the distance to it that the target moves after each window."""
+    critic_iterations, critic_rate, target_rate = 8, 2e-3, 0.2
+    """Gradients of the critic for each window, their rate, and the share of the distance that the target then moves."""
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator):
-        short = config.short_horizon
-        if short.window < 1:
-            raise ValueError(f"window={short.window} of a short horizon must be at least 1 control interval.")
-        if short.window > twin.plant.n_steps:
+        if config.window > twin.plant.n_steps:
             raise ValueError(
-                f"window={short.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
-                f"{twin.plant.name!r}; 0 plans over whole episodes."
+                f"window={config.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
+                f"{twin.plant.name!r}; multi_start plans over whole episodes."
             )
-        self.twin, self.policy, self.iterations, self.config = twin, policy, config.iterations, short
+        self.twin, self.policy, self.iterations, self.window = twin, policy, config.iterations, config.window
         n_o = len(twin.plant.observations)
         critic = mlp(n_o, self.critic_hidden, 1, generator=generator, activation=nn.SiLU)
         self.critic = critic.to(generator.device)
@@ -83,7 +80,7 @@ class ShortHorizon:
     def restart(self) -> None:
         """Copy the policy anew, because its weights have jumped."""
         self.learner = copy.deepcopy(self.policy)
-        self._optimiser = torch.optim.Adam(self.learner.parameters(), lr=self.config.policy_rate, betas=self.moments)
+        self._optimiser = torch.optim.Adam(self.learner.parameters(), lr=self.policy_rate, betas=self.moments)
 
     def plan(self, episodes: Scenario) -> Descended:
         """Give the policy the weights of the copy after its descent; see :meth:`Planner.plan`."""
@@ -107,7 +104,7 @@ class ShortHorizon:
         Returns:
             Mean norm of the gradients of J_w, relative to the mean cost of the first sweep.
         """
-        plant, n = self.twin.plant, self.config.window
+        plant, n = self.twin.plant, self.window
         batch, count = len(exogenous), exogenous.shape[1] // n
         with torch.no_grad():
             flown = self.twin.control(self.learner, initial_state, exogenous)
@@ -163,7 +160,7 @@ class ShortHorizon:
         seen: Float[Tensor, "batch m n_o"],
         over: Bool[Tensor, "batch m"] | None = None,
     ) -> float:
-        gamma, n = self.config.discount, costs.shape[1]
+        gamma, n = self.discount, costs.shape[1]
         weights = (1.0 - gamma) * gamma ** torch.arange(n, dtype=costs.dtype, device=costs.device)
         J_w = (costs * weights).sum(-1) + gamma**n * self._values(seen[:, -1], None if over is None else over[:, -1])
         self._optimiser.zero_grad(set_to_none=True)
@@ -179,7 +176,7 @@ class ShortHorizon:
         over: Bool[Tensor, "batch m"] | None = None,
     ) -> None:
         targets = self._targets(costs, seen, over)
-        for _ in range(self.config.critic_iterations):
+        for _ in range(self.critic_iterations):
             errors = self.critic(seen[:, :-1]).squeeze(-1) - targets
             loss = (errors if over is None else errors[~over[:, :-1]]).square().mean()
             self._critic_optimiser.zero_grad(set_to_none=True)
@@ -197,7 +194,7 @@ class ShortHorizon:
         over: Bool[Tensor, "batch m"] | None = None,
     ) -> Float[Tensor, "batch n"]:
         """The critic's targets (1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), computed from the last interval."""
-        gamma, mixing = self.config.discount, self.mixing
+        gamma, mixing = self.discount, self.mixing
         values = self._values(seen, over)
         following, found = values[:, -1], []
         for cost, value in zip(costs.flip(1).unbind(1), values[:, 1:].flip(1).unbind(1), strict=True):

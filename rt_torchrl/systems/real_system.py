@@ -1,21 +1,145 @@
 """A real system that is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from rt_torchrl.export.controller import Controller
+from rt_torchrl.options import array_of
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.around_system import AroundSystem, innermost
-from rt_torchrl.systems.environment import declare_specs, ended_early
-from rt_torchrl.systems.reading import Actuation, Reading, in_units, require_numbers
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.environment import AroundSystem, declare_specs, ended_early, innermost
+
+
+def joined(*entries: Tensor) -> Tensor:
+    """The entries joined into one vector, one behind the other."""
+    return torch.cat(entries, -1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """The place of a plant's vector in an environment's report; the vector is offset + scale·of(entries).
+
+    Args:
+        keys: entries of the environment's TensorDict that are read.
+        of: function that makes the vector of these entries. It takes them in the order of ``keys``, in double
+            precision, with the features last; by default it joins them. For an angle whose sine and cosine are
+            reported, it is an arc tangent.
+        scale: one unit of the vector in the plant's units: a number for all signals, or one for each signal.
+        offset: value in the plant's units where the vector is zero: a number for all signals, or one for each signal.
+
+    Raises:
+        ValueError: if a number of ``scale`` or ``offset`` is not finite.
+    """
+
+    keys: tuple[NestedKey, ...] = ("observation",)
+    of: Callable[..., Tensor] = joined
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] = 0.0
+
+    def __post_init__(self) -> None:
+        require_numbers("reading", scale=self.scale, offset=self.offset)
+
+    def read(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+        """The vector in the plant's units.
+
+        Raises:
+            ValueError: if :meth:`vector` raises it, or the vector is not finite.
+        """
+        vector = self.vector(reported, signals, what)
+        if not vector.isfinite().all():
+            names = [signal.name for signal in signals]
+            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {vector[0].tolist()}.")
+        return vector
+
+    def vector(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+        """The vector in the plant's units, whatever its values.
+
+        Raises:
+            ValueError: if an entry is missing, or the vector does not have the shape of the signals.
+        """
+        self.require(reported, what)
+        vector = self.of(*(reported.get(key).double() for key in self.keys))
+        names = [signal.name for signal in signals]
+        if tuple(vector.shape) != (*reported.batch_size, len(signals)):
+            raise ValueError(
+                f"{what}, read from {list(self.keys)}, has shape {tuple(vector.shape)}; the plant needs "
+                f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
+            )
+        return in_units(vector, self.scale, self.offset).reshape(1, len(signals))
+
+    def require(self, reported: TensorDictBase, what: str) -> None:
+        """Refuse a report that lacks an entry that is read.
+
+        Raises:
+            ValueError: if an entry is missing; it names the missing entries and those that are there.
+        """
+        missing = [key for key in self.keys if reported.get(key, None) is None]
+        if missing:
+            known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
+            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuation:
+    """The place where an environment takes its action; the plant's command is offset + scale·action.
+
+    Args:
+        key: entry of the environment's TensorDict that takes the action.
+        scale: one unit of the environment's action in the plant's units: a number for all actions, or one for each.
+        offset: command of the plant where the environment's action is zero: a number for all actions, or one for each.
+
+    Raises:
+        ValueError: if a number of ``scale`` or ``offset`` is not finite, or a scale is zero.
+    """
+
+    key: NestedKey = "action"
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] = 0.0
+
+    def __post_init__(self) -> None:
+        require_numbers("actuation", scale=self.scale, offset=self.offset)
+        if not (np.asarray(self.scale) != 0.0).all():
+            raise ValueError(f"scale={self.scale} of the actuation must not be zero.")
+
+    def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """The environment's action for a command in the plant's units."""
+        scale, offset = (
+            torch.as_tensor(x, dtype=torch.float64, device=command.device) for x in (self.scale, self.offset)
+        )
+        return (command - offset) / scale
+
+
+def require_numbers(what: str, **values: float | Sequence[float]) -> None:
+    """Refuse arguments that are NaN or infinite.
+
+    Args:
+        what: object that has these arguments, as the error calls it.
+        values: arguments by name.
+
+    Raises:
+        ValueError: if an argument is not finite; it names the first one.
+    """
+    for argument, value in values.items():
+        found = array_of(argument, value)
+        # A plant may have no inputs, but a reading has numbers.
+        if not np.isfinite(found).all() or (found.size == 0 and argument != "exogenous"):
+            raise ValueError(f"{argument}={value} of the {what} must be finite: a number, or one for each signal.")
+
+
+def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Sequence[float]) -> Tensor:
+    """offset + scale·values, in double precision."""
+    double = partial(torch.as_tensor, dtype=torch.float64, device=values.device)
+    return double(offset) + double(scale) * values
 
 
 def episode_seed(seed: int, number: int) -> int:
@@ -179,10 +303,12 @@ class RealSystem(EnvBase):
         self._seed, self._episodes = state["seed"], state["episodes"]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if self._seed is not None:
-            # The seed counts episodes, not resets: a reset need not be followed by a step.
-            self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
-        self._reported, self._step_count = self.env.reset(), 0
+        # The seed counts episodes, not resets: a reset need not be followed by a step.
+        seed = None if self._seed is None else episode_seed(self._seed, self._episodes)
+        in_reset = seed is not None and _is_gymnasium(self.env)  # whose set_seed would reset once more
+        if seed is not None and not in_reset:
+            self.env.set_seed(seed, static_seed=True)
+        self._reported, self._step_count = self.env.reset(**({"seed": seed} if in_reset else {})), 0
         if self._controller is not None:
             measured = self._state.read(self._reported, self._read, "state").cpu()
             self._memory = self._controller.start(measured, self._input(self._reported).cpu())
@@ -227,6 +353,8 @@ class RealSystem(EnvBase):
         last = self._step_count >= self.plant.n_steps and not over
         if stepped["next", "done"].any() and not (last or over):
             raise ended_early(stepped["next"], self._step_count, self.plant)
+        if (last or over) and hasattr(innermost(self.env), "end_episode"):
+            innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
         cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
         after = self._entries(applied, ended=last)
@@ -278,3 +406,10 @@ class RealSystem(EnvBase):
         """Close the environment too, such as its simulator or its connection."""
         self.env.close(**kwargs)
         super().close(**kwargs)
+
+
+def _is_gymnasium(env: EnvBase) -> bool:
+    """Whether an environment is one of Gymnasium, which takes a seed in its reset."""
+    while isinstance(env, AroundSystem | TransformedEnv):
+        env = env.env if isinstance(env, AroundSystem) else env.base_env
+    return isinstance(env, GymWrapper)

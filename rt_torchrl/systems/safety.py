@@ -1,30 +1,238 @@
 """A safety layer between a policy and a real system: limits on what is sent, a watchdog on what comes back."""
 
+import json
+import math
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, cast
 
 import torch
+from jaxtyping import Bool
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Unbounded
+from torchrl.data import Binary, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.action_limits import ActionLimits, components
-from rt_torchrl.systems.around_system import AroundSystem, innermost, require_interval
-from rt_torchrl.systems.safety_config import SafetyConfig
-from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
-
-__all__ = ["WRONG", "Fallback", "SafetyConfig", "SafetyLayer"]
+from rt_torchrl.options import array_of, require_range
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
+from rt_torchrl.systems.environment import AroundSystem, innermost, require_interval
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
 """Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
-
 KEPT = 16
 """Number of episodes whose reports are kept: a system may operate for years."""
+TOLERANCE = 0.5
+"""Share of an interval by which the system's clock may miss it, unless a tolerance is given."""
+ROUNDING = 1e-9
+"""Slack in comparisons of times that are sums of intervals [s], and share of a rate by which rounding may exceed it."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
+Ends = tuple[tuple[float, ...], tuple[float, ...]]
+
+
+class SafetyEvent(NamedTuple):
+    """One control interval in which the layer acted or saw a fault.
+
+    ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
+    policy's action was not finite, and ``fallback`` that the fallback acted. ``missing``, ``not finite``, ``out of
+    range``, ``frozen``, ``clock`` and ``late`` are faults of the observation at the end of the interval. ``limit`` says
+    that the system has left its limits, and ``actuator`` that an actuator does not follow. ``truncated`` says that the
+    layer ended the episode.
+    """
+
+    episode: int
+    step: int
+    time: float  # start of the interval, counted from the start of the episode [s]
+    reasons: dict[str, str]
+    asked: list[float]
+    applied: list[float]
+    at: float  # end of the interval on this machine's clock, counted from 1970 [s]
+
+    def line(self) -> str:
+        """The event as one line of JSON, with null for every number that is not finite."""
+        entry = self._asdict()
+        for key in ("asked", "applied"):
+            entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
+        return json.dumps(entry)
+
+
+@dataclass
+class SafetyReport:
+    """Events of one episode, the number of intervals in which each reason occurred, and where readings are wrong.
+
+    ``wrong`` holds the intervals at whose end the observation is wrong, also those of which this became known later.
+    """
+
+    events: list[SafetyEvent] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    wrong: set[int] = field(default_factory=set)
+
+
+class ActionLimits:
+    r"""Limits that saturate an action, and then hold :math:`|a_k - a_{k-1}| \le r\,\Delta t`.
+
+    If the last action lies outside the range, both limits cannot hold; then the range holds.
+
+    Args:
+        spec: spec of the action; its own range always holds.
+        config: range and rates of the actions, and the control interval Δt.
+
+    Raises:
+        ValueError: if a number does not fit the actions, the range is empty, or a rate is not positive.
+    """
+
+    def __init__(self, spec: TensorSpec, config: SafetyConfig):
+        self.spec, low, high = spec, config.low, config.high
+        whole = torch.full(spec.shape, torch.inf, dtype=spec.dtype, device=spec.device)
+        own = getattr(spec.space, "low", -whole), getattr(spec.space, "high", whole)
+        self.low = own[0] if low is None else torch.maximum(own[0], self.constant("low", low))
+        self.high = own[1] if high is None else torch.minimum(own[1], self.constant("high", high))
+        if not ((self.low <= self.high) & (self.low < math.inf) & (self.high > -math.inf)).all():
+            raise ValueError(f"low={low} and high={high} leave no action of the system's own range {spec.space}.")
+        self._increment = None if config.rates is None else config.interval * self.constant("rates", config.rates)
+        if self._increment is not None and not (self._increment > 0.0).all():
+            raise ValueError(f"rates={config.rates} must be positive; infinity does not limit an action.")
+
+    def constant(self, argument: str, values: Sequence[float]) -> Tensor:
+        """The action of these values, one number for each component.
+
+        Raises:
+            ValueError: if the values are too many or too few, or one is NaN.
+        """
+        action = torch.as_tensor(array_of(argument, values), dtype=self.spec.dtype, device=self.spec.device)
+        if action.shape != self.spec.shape[-1:] or action.isnan().any():
+            raise ValueError(f"{argument}={values} must have {self.spec.shape[-1]} numbers, one for each action.")
+        return action.expand(self.spec.shape)
+
+    def sendable(self, argument: str, values: Sequence[float]) -> Tensor:
+        """The action of these values, which must lie in the range, so that it is sent without a change.
+
+        Raises:
+            ValueError: if the values are too many or too few, one is not finite, or one lies outside the range.
+        """
+        action = self.constant(argument, values)
+        if not ((action >= self.low) & (action <= self.high) & action.isfinite()).all():
+            raise ValueError(
+                f"{argument}={values} must lie in the range of the actions, {self.low.flatten().tolist()} to "
+                f"{self.high.flatten().tolist()}; the machine gets nothing outside it."
+            )
+        return action
+
+    def __call__(self, action: Tensor, last: Tensor | None) -> tuple[Tensor, dict[str, str]]:
+        """The nearest action within the limits, and the components that ``range`` and ``rate`` have changed.
+
+        Args:
+            action: finite action.
+            last: action that was applied before; None leaves the rate free.
+        """
+        inside = torch.minimum(torch.maximum(action, self.low), self.high)
+        reached = inside
+        if self._increment is not None and last is not None:
+            reached = torch.minimum(torch.maximum(inside, last - self._increment), last + self._increment)
+        # The rate must not lead out of the range, even if the last action was outside it.
+        sent = torch.minimum(torch.maximum(reached, self.low), self.high)
+        held = {"range": (inside != action) | (sent != reached), "rate": reached != inside}
+        return sent, {name: _components(mask) for name, mask in held.items() if mask.any()}
+
+
+class Watchdog:
+    """Judges the observations of a real system: are they finite, within their ranges, in order and in time?
+
+    A watchdog trips at a fault and stays tripped until it has seen no fault for the hold time. A sample that comes
+    twice, or is left out, shows in the system's clock. The clock may also jump and go on from there; then one interval
+    is wrong. A sensor that is frozen repeats its value.
+
+    The attribute ``stale`` holds the number of readings before the present one that are wrong too, because a sensor was
+    frozen before that could be known.
+
+    Args:
+        config: limits on observations.
+    """
+
+    def __init__(self, config: SafetyConfig):
+        self.config = config
+        self._ends = {"out of range": _tensors(config.ranges), "limit": _tensors(config.limits)}
+        self._frozen = {entry: torch.as_tensor(count) for entry, count in config.frozen.items()}
+        self._tolerance = config.clock_tolerance or TOLERANCE * config.interval
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a new episode, in which nothing has been read and no fault has been seen."""
+        self._since, self._until = math.inf, -math.inf
+        self._sound = self._last = -math.inf  # the clock at the last sound reading, and at the last reading
+        self._intervals, self.stale = 0, 0  # since the last sound reading of the clock
+        self._values: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def faults(self, entries: Mapping[str, Tensor], elapsed: float) -> dict[str, str]:
+        """Faults of an observation by kind, each with a detail; an entry that is missing is not judged.
+
+        Args:
+            entries: entries of the observation.
+            elapsed: wall-clock time that the observation took to come [s].
+        """
+        faults: dict[str, str] = {}
+        broken = [name for name, value in entries.items() if not value.isfinite().all()]
+        if broken:
+            faults["not finite"] = ", ".join(broken)
+        for kind, ends in self._ends.items():
+            outside = [name for name in ends if name in entries and not _inside(entries[name], ends[name])]
+            if outside:
+                faults[kind] = ", ".join(outside)
+        if self.config.clock is not None and (wrong := self._clock_fault(entries.get(self.config.clock))):
+            faults["clock"] = wrong
+        self.stale = 0
+        for entry, limit in self._frozen.items():
+            count = self._equal(entry, entries[entry], limit) if entry in entries else 0
+            if count:
+                faults["frozen"] = f"{entry}, {count} equal readings"
+                self.stale = max(self.stale, count - 2)
+        if elapsed > self.config.deadline:
+            faults["late"] = f"{elapsed:.6g} s, deadline {self.config.deadline:g} s"
+        return faults
+
+    def _clock_fault(self, value: Tensor | None) -> str | None:
+        """What is wrong with the clock; a step is right if it fits the last sound reading or the last one of all."""
+        self._intervals += 1
+        now = math.nan if value is None else float(value.flatten()[0])
+        if not math.isfinite(now):
+            self._last = -math.inf
+            return None
+        interval, last, self._last = self.config.interval, self._last, now
+        steps = (now - self._sound - self._intervals * interval, now - last - interval)
+        if math.isfinite(self._sound) and not any(abs(step) <= self._tolerance for step in steps):
+            return f"{now - max(last, self._sound):.6g} s after the last reading, interval {interval:g} s"
+        self._sound, self._intervals = now, 0
+        return None
+
+    def _equal(self, entry: str, value: Tensor, limit: Tensor) -> int:
+        """Number of equal readings in a row, with this one, of the component frozen for longest; 0 if none is."""
+        last, counts = self._values.get(entry, (torch.full_like(value, torch.nan), torch.ones_like(value)))
+        counts = torch.where(value == last, counts + 1, torch.ones_like(counts))
+        self._values[entry] = value.clone(), counts
+        limit = limit.to(counts)
+        return int(torch.where((limit > 0.0) & (counts >= limit), counts, 0.0).max())
+
+    def note(self, t: float, faulty: bool) -> None:
+        """Take note of an observation at time t of the episode [s] and whether it was faulty."""
+        if faulty:
+            self._since = min(self._since, t)
+            # Without a hold time the watchdog is tripped for the interval that begins now.
+            self._until = t + max(self.config.hold, 2.0 * ROUNDING)
+        elif not self.tripped(t):
+            self._since = math.inf
+
+    def tripped(self, t: float) -> bool:
+        """Whether the fallback acts in the interval that begins at t [s]."""
+        return t < self._until - ROUNDING
+
+    def exhausted(self, t: float) -> bool:
+        """Whether the watchdog has been tripped, at t [s], for as long as its patience."""
+        return self.tripped(t) and t - self._since >= self.config.patience - ROUNDING
 
 
 class SafetyLayer(AroundSystem):
@@ -82,17 +290,13 @@ class SafetyLayer(AroundSystem):
             )
         require_interval(env, config.interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
-        self.env, self.config = env, config
-        self._clock = clock
+        self.env, self.config, self._clock = env, config, clock
         self.reports: deque[SafetyReport] = deque(maxlen=KEPT)
         self._episodes = 0
         self._good: dict[str, Tensor] = {}
-        self.watchdog = config.watchdog()
         self._unwritten: OSError | None = None
         self._make_specs()
-        self.limits = ActionLimits(
-            env.action_spec, interval=config.interval, low=config.low, high=config.high, rates=config.rates
-        )
+        self.watchdog, self.limits = Watchdog(config), ActionLimits(env.action_spec, config)
         self._rest = None if config.rest is None else self.limits.sendable("rest", config.rest)
         self._following = None if config.following is None else self.limits.constant("following", config.following)
         self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
@@ -103,12 +307,7 @@ class SafetyLayer(AroundSystem):
     def _make_specs(self) -> None:
         observation, action = self.env.full_observation_spec.clone(), self.env.action_spec
         clock = [] if self.config.clock is None else [self.config.clock]
-        named = {
-            "ranges": self.config.ranges,
-            "limits": self.config.limits,
-            "frozen": self.config.frozen,
-            "clock": clock,
-        }
+        named = {name: getattr(self.config, name) for name in ("ranges", "limits", "frozen")} | {"clock": clock}
         for argument, entries in named.items():
             unknown = set(entries) - set(observation.keys())
             if unknown:
@@ -137,39 +336,38 @@ class SafetyLayer(AroundSystem):
         if self._unwritten is not None:
             error, self._unwritten = self._unwritten, None
             raise error  # now that nothing moves; in the episode the system came first
-        asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
-        found = self.env.reset(asked, **kwargs).exclude("_reset")
+        mask = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
+        reading = self.env.reset(mask, **kwargs).exclude("_reset")
         self.watchdog.begin()
         if hasattr(self._fallback, "begin"):
             self._fallback.begin()
-        faults = self._faults(found, 0.0)
+        faults = self._faults(reading, 0.0)
         if faults.pop("limit", None):
             self.watchdog.note(0.0, True)  # the fallback begins
         if faults:
-            read = {key: found[key].flatten().tolist() for key in self._watched if key in found}
+            read = {key: reading[key].flatten().tolist() for key in self._watched if key in reading}
             raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
         self._step_count, self._passed, self._last, self._good = 0, 0, self._rest, {}
         if getattr(innermost(self.env), "reads_applied", False):
-            self._last = found["applied"].clone()  # of a machine in operation
-        self._remember(found)
-        if "applied" not in found:
-            found["applied"] = self.action_spec.zero() if self._rest is None else self._rest.clone()
-        self._found = self._flag(False), self._flag(False)
-        found["tripped"], found["refused"] = self._found
-        found["truncated"] = found.get("truncated", self._flag(False))
-        return found
+            self._last = reading["applied"].clone()  # of a machine in operation
+        self._flags = self._flag(False), self._flag(False)
+        return self._begun(reading, self._rest)
+
+    def _begun(self, reading: TensorDictBase, applied: Tensor | None) -> TensorDictBase:
+        """What an episode or a window begins with; the machine need not say what it has applied."""
+        reading = self._remember(reading)
+        if "applied" not in reading:
+            reading["applied"] = self.action_spec.zero() if applied is None else applied.clone()
+        reading["tripped"], reading["refused"] = (flag.clone() for flag in self._flags)
+        reading["truncated"] = reading.get("truncated", self._flag(False))
+        return reading
 
     def _count_window(self) -> None:
         self._passed, self._step_count = self._passed + self._step_count, 0
 
-    def _gone_on(self, found: TensorDictBase) -> TensorDictBase:
+    def _gone_on(self, reading: TensorDictBase) -> TensorDictBase:
         """The present reading once more; what the layer has found in it, its limits and its watchdog go on."""
-        found = self._remember(found.copy())
-        if "applied" not in found:
-            found["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
-        found["tripped"], found["refused"] = self._found[0].clone(), self._found[1].clone()
-        found["truncated"] = found.get("truncated", self._flag(False))
-        return found
+        return self._begun(reading.copy(), self._last)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -179,29 +377,28 @@ class SafetyLayer(AroundSystem):
             self._episodes += 1
         past = self._passed + self._step_count
         t, end = (self.config.interval * k for k in (past, past + 1))
-        asked = tensordict["action"]
         applied, reasons = self._chosen(t, tensordict)
         start = self._clock()
-        found = self.env.step(tensordict.exclude("next", "tripped", "refused").set("action", applied.clone()))["next"]
-        faults = self._faults(found, self._clock() - start)
+        sent = tensordict.exclude("next", "tripped", "refused").set("action", applied.clone())
+        reading = self.env.step(sent)["next"]
+        faults = self._faults(reading, self._clock() - start)
         self.watchdog.note(end, bool(faults))
-        found = self._remember(found.copy())
+        reading = self._remember(reading.copy())
         if "applied" not in self.env.full_observation_spec:
-            found["applied"] = applied.clone()
-        found["tripped"] = self._flag(self.watchdog.tripped(end))
-        found["refused"] = self._flag(not WRONG.isdisjoint(faults))
-        self._found = found["tripped"], found["refused"]
-        if found["refused"].any():
-            first = max(0, self._step_count - self.watchdog.samples.stale)
+            reading["applied"] = applied.clone()
+        self._flags = self._flag(self.watchdog.tripped(end)), self._flag(not WRONG.isdisjoint(faults))
+        reading["tripped"], reading["refused"] = self._flags
+        if reading["refused"].any():
+            first = max(0, self._step_count - self.watchdog.stale)
             self.report.wrong.update(range(first, self._step_count + 1))
-        reasons |= faults | self._not_followed(applied, found["applied"])
-        found["truncated"] = found.get("truncated", self._flag(False))
+        reasons |= faults | self._not_followed(applied, reading["applied"])
+        reading["truncated"] = reading.get("truncated", self._flag(False))
         if self.watchdog.exhausted(end):
-            reasons["truncated"] = f"tripped for {self.watchdog.patience:g} s"
-            found["truncated"], found["done"] = self._flag(True), self._flag(True)
-        self._note(reasons, asked, applied)
+            reasons["truncated"] = f"tripped for {self.config.patience:g} s"
+            reading["truncated"], reading["done"] = self._flag(True), self._flag(True)
+        self._note(reasons, tensordict["action"], applied)
         self._last, self._step_count = applied, self._step_count + 1
-        return found
+        return reading
 
     def _chosen(self, t: float, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, str]]:
         """The action to be sent to the system, and the reasons why it is not the one that was asked for."""
@@ -223,12 +420,11 @@ class SafetyLayer(AroundSystem):
         applied, held = self.limits(action, self._last)
         return applied, reasons | held
 
-    def _faults(self, found: TensorDictBase, elapsed: float) -> dict[str, str]:
+    def _faults(self, reading: TensorDictBase, elapsed: float) -> dict[str, str]:
         """Faults of an observation by kind, each with a detail."""
-        missing = [key for key in self._watched if key not in found]
-        said = {"missing": f"{', '.join(missing)}, which the system declares to observe"} if missing else {}
-        there = {key: found[key] for key in self._watched if key in found}
-        faults = said | self.watchdog.faults(there, elapsed)
+        missing = [key for key in self._watched if key not in reading]
+        faults = {"missing": f"{', '.join(missing)}, which the system declares to observe"} if missing else {}
+        faults |= self.watchdog.faults({key: reading[key] for key in self._watched if key in reading}, elapsed)
         reasons: dict[str, str] = getattr(innermost(self.env), "reasons", {})  # of a machine that says why
         if reasons and "not finite" in faults:
             faults["not finite"] += f" ({'; '.join(f'{tag}: {why}' for tag, why in reasons.items())})"
@@ -239,16 +435,16 @@ class SafetyLayer(AroundSystem):
         if self._following is None:
             return {}
         behind = (applied - sent).abs() > self._following
-        return {"actuator": components(behind)} if behind.any() else {}
+        return {"actuator": _components(behind)} if behind.any() else {}
 
-    def _remember(self, found: TensorDictBase) -> TensorDictBase:
+    def _remember(self, reading: TensorDictBase) -> TensorDictBase:
         """Replace values that are missing or not finite by the last finite ones."""
         for key in self._watched:
-            value = found[key] if key in found else torch.full_like(self._good[key], torch.nan)
+            value = reading[key] if key in reading else torch.full_like(self._good[key], torch.nan)
             good = self._good.get(key, torch.zeros_like(value))
             self._good[key] = torch.where(value.isfinite(), value, good)
-            found[key] = self._good[key]
-        return found
+            reading[key] = self._good[key]
+        return reading
 
     def _note(self, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
         if not reasons:
@@ -275,3 +471,114 @@ class SafetyLayer(AroundSystem):
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state, *args, **kwargs)
+
+
+def layer_of(env: object) -> SafetyLayer | None:
+    """The safety layer of a real system; None if there is none."""
+    inner: Any = env
+    while inner is not None and not isinstance(inner, SafetyLayer):
+        inner = getattr(inner, "env", None)
+    return inner
+
+
+class OperatingLimits:
+    """The limits of a plant as numbers for every signal: bounds on states, actions and rates for every policy.
+
+    Args:
+        plant: plant that gives the signals.
+        config: the limits.
+
+    Raises:
+        ValueError: if the plant has no such state or action, a limit lies beyond the signal's own range, where it would
+            limit nothing, or the limits leave no action of its range.
+    """
+
+    def __init__(self, plant: Plant, config: OperatingLimitsConfig):
+        self.config, self._dt, self._read = config, plant.dt, len(plant.readings)
+        self.states = _ends_of("states", plant.readings, config.states)
+        self.actions = _ends_of("actions", plant.actions, config.actions)
+        for action, low, high in zip(plant.actions, *self.actions, strict=True):
+            if not max(low, action.low) < min(high, action.high):
+                raise ValueError(
+                    f"limits.actions {action.name}={low:g} to {high:g} leave nothing of the action's range "
+                    f"{action.low:g} to {action.high:g} {action.unit}."
+                )
+        _require_known("rates", plant.actions, config.rates)
+        for what, signals in (("states", plant.readings), ("actions", plant.actions)):
+            for signal in signals:
+                for end in filter(math.isfinite, getattr(config, what).get(signal.name, ())):
+                    name = f"limits.{what} {signal.name}"
+                    require_range(name, end, signal.low, signal.high, unit=signal.unit, of="the plant")
+        for action in plant.actions:
+            if action.name in config.rates:
+                # A greater rate than that of the whole range in an interval limits nothing.
+                greatest, unit = (action.high - action.low) / plant.dt, f"{action.unit}/s"
+                name = f"limits.rates {action.name}"
+                require_range(name, config.rates[action.name], 0.0, greatest, unit=unit, of="the plant")
+        self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
+
+    def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
+        """Whether a limit of ``states``, ``actions`` or ``rates`` is left in the control intervals of trajectories."""
+        states, actions = flown.states[..., 1:, : self._read], flown.actions
+        steps = torch.cat([torch.zeros_like(actions[..., :1, :]), actions.diff(dim=-2)], -2).abs()
+        greatest = self._dt * actions.new_tensor(self.rates) * (1.0 + ROUNDING)
+        return {
+            "states": _outside(states, self.states),
+            "actions": _outside(actions, self.actions),
+            "rates": (steps > greatest).any(-1),
+        }
+
+    def safety(self) -> dict[str, Any]:
+        """Options of a :class:`SafetyConfig` that hold these limits on a system in the plant's own units."""
+        options: dict[str, Any] = {"low": self.actions[0], "high": self.actions[1], "rates": tuple(self.rates)}
+        return options | ({"limits": {"state": self.states}} if self.config.states else {})
+
+
+def require_layer(env: EnvBase) -> None:
+    """Refuse a real system without a safety layer, which alone can hold limits.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if layer_of(env) is None:
+        raise ValueError(
+            "limits are given, and the real system has no safety layer that holds them: put a SafetyLayer around the "
+            "environment, with SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())."
+        )
+
+
+def _components(mask: Tensor) -> str:
+    """The components of an action that a mask marks, in words."""
+    return "action " + ", ".join(map(str, mask.flatten().nonzero().flatten().tolist()))
+
+
+def _tensors(ranges: Mapping[str, Range]) -> dict[str, tuple[Tensor, Tensor]]:
+    def ends(low: Any, high: Any) -> tuple[Tensor, Tensor]:
+        return torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)
+
+    return {entry: ends(*given) for entry, given in ranges.items()}
+
+
+def _inside(value: Tensor, ends: tuple[Tensor, Tensor]) -> bool:
+    low, high = (end.to(value) for end in ends)
+    # A value that is not finite is a fault of its own.
+    return bool(((value >= low) & (value <= high) | ~value.isfinite()).all())
+
+
+def _outside(values: Tensor, ends: Ends) -> Bool[Tensor, "*batch n"]:
+    low, high = (values.new_tensor(end) for end in ends)
+    return ~((values >= low) & (values <= high)).all(-1)
+
+
+def _ends_of(what: str, signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:
+    _require_known(what, signals, given)
+    free = (-math.inf, math.inf)
+    low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
+    return low, high
+
+
+def _require_known(what: str, signals: tuple[Signal, ...], given: Mapping[str, Any]) -> None:
+    names = [signal.name for signal in signals]
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise ValueError(f"limits.{what} has {', '.join(unknown)}; the plant has {', '.join(names)}.")

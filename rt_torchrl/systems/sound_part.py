@@ -1,16 +1,18 @@
-"""The sound part of a real episode: the intervals that show what the system did, and the faults of the others."""
+"""The sound part of a real episode: the intervals that show what the system did, and the faults of the others.
+
+What is not finite is refused on the way to a learner.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.systems.safety_report import SafetyReport
+from rt_torchrl.systems.safety import SafetyReport, layer_of
 
 GREATEST = torch.finfo(torch.float32).max
 """Greatest number to be learned from: the long-term memory keeps its priorities in single precision."""
@@ -83,77 +85,117 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
         plant: plant that gives the length of an episode and the control interval.
         report: report of the safety layer about this episode, if there is one.
     """
-    refused, (overflow, faults) = _refused(episode, report), _overflows(episode, plant.dt)
-    faults = _reported(report) + faults
+    refused, (overflow, overflows) = _refused(episode, report), _overflows(episode, plant.dt)
     wrong = refused | overflow
     wrong[1:] |= refused[:-1]  # what is read at the end of an interval is the start of the next one
     if "refused" in episode.keys():  # noqa: SIM118
         wrong[:1] |= episode["refused"][:1].flatten().cpu()  # of the window before, where nothing was reset
-    said = []
+    reasons = []
     if refused.any():
         at = refused.nonzero().flatten().tolist()
-        said.append(f"the safety layer refused {len(at)} of its readings, the first at the end of interval {at[0]}")
-    said += [fault.detail for fault in faults if fault.kind == "overflow"][:1]
-    sound = (~wrong).tolist()
+        reasons.append(f"the safety layer refused {len(at)} of its readings, the first at the end of interval {at[0]}")
+    reasons += [fault.detail for fault in overflows][:1]
+    n, sound = len(episode), (~wrong).tolist()
     starts = [k for k, good in enumerate(sound) if good and (k == 0 or not sound[k - 1])]
-    ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == len(sound) or not sound[k + 1])]
-    # An episode that is over at once shows less than a fault leaves.
-    over = len(episode) >= SHORTEST and plant.end_cost is not None and bool(episode["next", "terminated"][-1].any())
-    whole = (len(episode) == plant.n_steps or over) and all(sound)
-    return SoundPart(list(zip(starts, ends, strict=True)), faults, "; ".join(said), whole)
+    ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == n or not sound[k + 1])]
+    over = plant.end_cost is not None and bool(episode["next", "terminated"][-1].any())
+    if over and n < SHORTEST:
+        # An episode that is over at once shows less than a fault leaves.
+        state = ", ".join(
+            f"{signal.name} = {value:.4g} {signal.unit}"
+            for signal, value in zip(plant.readings, episode["next", "state"][-1].tolist(), strict=False)
+        )
+        reasons.append(
+            f"plant {plant.name!r} ended it (ended) after {n} of {plant.n_steps} control intervals, at {state}; "
+            f"{SHORTEST} are needed at least: begin with a controller that lasts (--start controller), or take a "
+            "smaller dt"
+        )
+    whole = (n == plant.n_steps or (over and n >= SHORTEST)) and all(sound)
+    parts = list(zip(starts, ends, strict=True))
+    return SoundPart(parts, _reported(report) + overflows, "; ".join(reasons), whole)
 
 
 def report_of(env: object) -> SafetyReport | None:
     """The report of the safety layer of a real system about its last episode; None if there is none."""
-    inner: Any = env
-    while inner is not None and not isinstance(inner, SafetyLayer):
-        inner = getattr(inner, "env", None)
-    return inner.report if inner is not None and inner.reports else None
+    layer = layer_of(env)
+    return layer.report if layer is not None and layer.reports else None
 
 
 def _refused(episode: TensorDictBase, report: SafetyReport | None) -> Bool[Tensor, " n"]:
     """The intervals at whose end a safety layer has refused the reading, also where it did so later."""
-    n, found = len(episode), torch.zeros(len(episode), dtype=torch.bool, device="cpu")
+    n = len(episode)
+    refused = torch.zeros(n, dtype=torch.bool, device="cpu")
     if "refused" in episode["next"].keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
-        found = episode["next", "refused"].flatten().cpu().clone()
-    for k in report.wrong if report is not None else ():
-        if k < n:
-            found[k] = True
-    return found
+        refused = episode["next", "refused"].flatten().cpu().clone()
+    refused[[k for k in (report.wrong if report is not None else ()) if k < n]] = True
+    return refused
 
 
 def _overflows(episode: TensorDictBase, dt: float) -> tuple[Bool[Tensor, " n"], list[Fault]]:
     """The intervals with numbers that are not finite in single precision, and a fault for each of their entries."""
-    found, faults = torch.zeros(len(episode), dtype=torch.bool, device="cpu"), []
+    wrong, faults = torch.zeros(len(episode), dtype=torch.bool, device="cpu"), []
     for key in LEARNED:
-        wrong = ~(episode[key].abs() <= GREATEST)
-        rows = wrong.flatten(1).any(-1).cpu()
+        beyond = ~(episode[key].abs() <= GREATEST)
+        rows = beyond.flatten(1).any(-1).cpu()
         if rows.any():
-            k = int(rows.nonzero()[0, 0])
-            value = episode[key][wrong][0].item()
-            said = f"{key} holds {value:g} in interval {k}, which is not finite in single precision"
-            faults.append(Fault("overflow", k, k * dt, said))
-        found |= rows
-    return found, faults
+            k, value = int(rows.nonzero()[0, 0]), episode[key][beyond][0].item()
+            detail = f"{key} holds {value:g} in interval {k}, which is not finite in single precision"
+            faults.append(Fault("overflow", k, k * dt, detail))
+        wrong |= rows
+    return wrong, faults
 
 
 def _reported(report: SafetyReport | None) -> list[Fault]:
     """The faults of a safety layer's report; a stretch of intervals with the same fault is one, at its beginning."""
-    found: list[Fault] = []
+    faults: list[Fault] = []
     last: dict[str, int] = {}
     for event in report.events if report is not None else ():
         for kind, detail in event.reasons.items():
             if kind not in FAULTS:
                 continue
             if last.get(kind) != event.step - 1:
-                found.append(Fault(kind, event.step, event.time, detail))
+                faults.append(Fault(kind, event.step, event.time, detail))
             last[kind] = event.step
-    return found
+    return faults
 
 
 def tried_in_vain(reasons: Sequence[str]) -> str:
     """The error of several real episodes in a row from which nothing can be learned."""
     return (
-        f"{len(reasons)} real episodes in a row cannot be learned from: {'; '.join(reasons)}. None of them was stored; "
-        "mend the system, its sensors, or the ranges of the safety layer, and go on with the next episode."
+        f"{len(reasons)} real episodes in a row cannot be learned from: {'; '.join(dict.fromkeys(reasons))}. None of "
+        "them was stored; mend the system, its sensors, or the ranges of the safety layer, and go on with the next "
+        "episode."
     )
+
+
+def finite_transitions(transitions: TensorDictBase) -> TensorDictBase:
+    """The transitions, whose numbers must be finite so that a learner may take them.
+
+    Raises:
+        ValueError: if one is not finite in single precision; it names the first one.
+    """
+    for key, values in transitions.items(include_nested=True, leaves_only=True):
+        if not values.is_floating_point():
+            continue
+        wrong = ~(values.abs() <= GREATEST)
+        if wrong.any():
+            k = int(wrong.flatten(1).any(-1).nonzero()[0, 0])
+            raise ValueError(
+                f"{key!r} of transition {k} is {values[k][wrong[k]][0].item():g}; what a learner stores must be finite "
+                f"and at most {GREATEST:.3g} in size. Nothing was stored; leave out what was not measured."
+            )
+    return transitions
+
+
+def finite_errors(td_errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The TD errors, which must be finite so that the long-term memory may take them.
+
+    Raises:
+        ValueError: if a TD error is not finite in single precision.
+    """
+    if not (td_errors.abs() <= GREATEST).all():
+        raise ValueError(
+            "the TD errors of an episode whose numbers are finite are not finite themselves: the critic has diverged. "
+            "Nothing was stored; use smaller learning rates or a smaller reward_scale."
+        )
+    return td_errors

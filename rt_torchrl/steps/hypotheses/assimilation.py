@@ -209,7 +209,7 @@ def make_assimilation(
     if config.sensors and isinstance(twin, TwinEnsemble):
         raise ValueError(
             f"sensors={config.sensors} of the assimilation do not go with hypotheses, which replay "
-            "the whole state; leave the sensors out, or the hypotheses by hypotheses.which='none'."
+            "the whole state; leave the sensors out, or the hypotheses by hypotheses.which=none."
         )
     if config.sensors:
         return SensorAssimilation(twin, config)

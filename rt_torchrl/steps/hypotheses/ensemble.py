@@ -167,21 +167,19 @@ def make_twin(
 
     Each hypothesis begins with a copy of the closure.
 
-    A configuration that names none takes all suspects of the plant; one that names some may name further ones, too.
-
     Raises:
         ValueError: if the plant suspects nothing of a name that the configuration lists.
     """
-    suspects = plant.suspects() if config.which == "automatic" else {}
-    if config.names:
-        suspects = {**suspects, **plant.further_suspects()}
-    unknown = [name for name in config.names if name not in suspects]
-    if unknown:
-        raise ValueError(
-            f"hypotheses.names: plant {plant.name!r} does not suspect {quoted(unknown)}; choose among "
-            f"{quoted(suspects) or '(nothing)'}, or give a TwinEnsemble of your own."
-        )
-    taken = {name: suspect for name, suspect in suspects.items() if not config.names or name in config.names}
+    taken = plant.suspects() if config.which == ("automatic",) else {}
+    if config.which not in (("automatic",), ("none",)):
+        known = {**plant.suspects(), **plant.further_suspects()}
+        unknown = [name for name in config.which if name not in known]
+        if unknown:
+            raise ValueError(
+                f"hypotheses.which: plant {plant.name!r} does not suspect {quoted(unknown)}; choose among "
+                f"{quoted(known) or '(nothing)'}, or give a TwinEnsemble of your own."
+            )
+        taken = {name: suspect for name, suspect in known.items() if name in config.which}
     if not taken:
         return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
     device = next((w.device for w in closure.parameters()), torch.device("cpu"))

@@ -1,22 +1,244 @@
-"""The acting side of an operation: control intervals of a real system, in windows of the length of an episode."""
+"""The acting side of an operation: control intervals of a real system, in windows of the length of an episode.
 
-from typing import Any
+A system in operation acts on while the algorithm learns; docs/connect_your_machine.md explains it.
+"""
+
+import copy
+import json
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.around_system import innermost
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.collectors import failure, pass_over
-from rt_torchrl.systems.environment import PlantEnv, ended_early
-from rt_torchrl.systems.operation.handover import BumplessPolicy
-from rt_torchrl.systems.operation.order import Order, ready
-from rt_torchrl.systems.operation.window import Window
-from rt_torchrl.systems.pace import Pace
-from rt_torchrl.systems.sound_part import report_of
+from rt_torchrl.systems.config import OperationConfig
+from rt_torchrl.systems.environment import PlantEnv, ended_early, innermost
+from rt_torchrl.systems.exploration import BumplessPolicy, ExplorationConfig
+from rt_torchrl.systems.safety import SafetyReport
+from rt_torchrl.systems.sound_part import EpisodeEndedError, report_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+
+FIRST = "first"
+"""Name of the policy or state feedback that acts before the trained policies do."""
+
+
+class Order(NamedTuple):
+    """A policy that is to take over at once, as it was when the order was given.
+
+    Attributes:
+        version: number of the order, from 0; each interval of a record names the version that acted in it.
+        name: name of the policy, such as its role.
+        weights: its weights.
+        strength: strength ξ of the exploration.
+        found: what was found about the policy before, such as ``predicted_violations``, by name.
+    """
+
+    version: int
+    name: str
+    weights: dict[str, Tensor]
+    strength: float
+    found: dict[str, float | str] | None = None
+
+    def ready(self, policies: Mapping[str, nn.Module]) -> nn.Module:
+        """The policy as a module of its own, ready to act: state feedback has made its first plan.
+
+        Args:
+            policies: a policy of each name, whose own weights stay as they are.
+        """
+        policy = copy.deepcopy(policies[self.name])
+        policy.load_state_dict(self.weights)
+        if isinstance(policy, StateFeedback):
+            policy.begin()
+        return policy
+
+
+class Window(NamedTuple):
+    """A window of operation, or the part of it before the system failed.
+
+    Attributes:
+        entries: its control intervals, of batch size ``1 k``; None if there are none.
+        ended: why the system did not reach the end of the window; None if it did.
+        report: what the safety layer did in it; None if there is no layer.
+        acted: numbers about what acted at its end, such as the times of the solves of model predictive control.
+    """
+
+    entries: TensorDict | None
+    ended: str | None = None
+    report: SafetyReport | None = None
+    acted: Mapping[str, float] | None = None
+
+
+class Operation(ABC):
+    """A real system in operation: windows come in, and policies are handed over, while the learner learns.
+
+    ``orders`` holds the orders, by version, that later windows may have flown, or that the last one has. ``report`` is
+    what the safety layer did in the window taken last, and ``acted`` numbers about what acted at its end, if there are
+    any. ``version`` is the number of the latest order, -1 before the first.
+
+    ``log`` names a file of events, one JSON object per line: ``taken``, the learner has taken the ``window``, which
+    ``versions`` flew in turn; ``handed over``, it has handed a ``version`` over; and ``resumed``, the run goes on with
+    this window and version after a stop, and what came after them is lost.
+
+    Args:
+        system: the real system as the learner knows it.
+        log: file of the events; None writes none.
+    """
+
+    def __init__(self, system: EnvBase, log: Path | None = None):
+        self.system, self.version, self.taken, self._log = system, -1, 0, log
+        self.orders: dict[int, Order] = {}
+        self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
+
+    @property
+    def closure(self) -> nn.Module | None:
+        """The true closure of the system, as far as it is known."""
+        closure: nn.Module | None = self.system.closure
+        return closure
+
+    @property
+    def begun(self) -> bool:
+        """Whether a policy has been handed over yet."""
+        return self.version >= 0
+
+    def hand_over(
+        self, name: str, policy: nn.Module, *, strength: float, found: dict[str, float | str] | None = None
+    ) -> None:
+        """Hand a policy over, which takes over while the system operates.
+
+        Args:
+            name: name of the policy: its role, or ``first``.
+            policy: the policy, as it is now.
+            strength: strength ξ of the exploration.
+            found: what was found about the policy before, by name.
+        """
+        weights = {key: value.detach().clone() for key, value in policy.state_dict().items()}
+        order = Order(self.version + 1, name, weights, strength, found)
+        self._pass_on(order)
+        self.version, self.orders[order.version] = order.version, order
+        self._note("handed over", version=self.version)
+
+    @abstractmethod
+    def _pass_on(self, order: Order) -> None:
+        """Pass an order on to what acts."""
+
+    @abstractmethod
+    def rollout(self) -> TensorDict:
+        """The oldest window that has not been taken yet, of batch size ``1 n``; waits for it if necessary.
+
+        Raises:
+            EpisodeEndedError: if the system failed in that window, or ended it; it holds the intervals before.
+        """
+
+    @abstractmethod
+    def waiting(self) -> bool:
+        """Whether a further window has come in already."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the operation; the system gets its safe action from whatever stands behind it."""
+
+    def _take(self, window: Window, acting: int) -> TensorDict:
+        """The control intervals of a window, where it is a whole one.
+
+        Args:
+            window: the window.
+            acting: version that acts at its end.
+        """
+        entries, self.report, self.acted = window.entries, window.report, window.acted
+        versions = [] if entries is None else list(dict.fromkeys(entries["version"].flatten().tolist()))
+        oldest = min([acting, *versions])
+        self.orders = {version: order for version, order in self.orders.items() if version >= oldest}
+        self._note("taken", window=self.taken, versions=versions)
+        self.taken += 1
+        if window.ended is not None or entries is None:
+            raise EpisodeEndedError(window.ended or "the window holds no interval", entries)
+        return entries
+
+    def _note(self, event: str, **values: Any) -> None:
+        if self._log is not None:
+            with self._log.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"event": event, **values}) + "\n")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next window depends on, in tensors and plain containers."""
+        return {
+            "orders": [order._asdict() for order in self.orders.values()],
+            "version": self.version,
+            "taken": self.taken,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the :meth:`state_dict` of an operation that was built with the same arguments."""
+        self.orders = {order["version"]: Order(**order) for order in state["orders"]}
+        self.version, self.taken = state["version"], state["taken"]
+        self._note("resumed", window=self.taken, version=self.version)
+
+
+def system_of(env: EnvBase | Operation) -> EnvBase:
+    """The real system itself, in operation or not."""
+    return env.system if isinstance(env, Operation) else env
+
+
+class Pace:
+    """Waits for the beginning of each control interval.
+
+    The attribute ``late`` is by how much the last interval began after it was due [s], and ``missed`` the number of
+    intervals that began a whole period late or later. These are not made up for: the pace goes on from the moment when
+    the late one began.
+
+    Args:
+        period: time from one beginning to the next [s].
+        clock: wall clock [s].
+        sleep: function that waits for some time [s].
+
+    Raises:
+        ValueError: if the period is not positive.
+    """
+
+    def __init__(
+        self,
+        period: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        if not period > 0.0:
+            raise ValueError(f"period={period} s of a control loop must be positive.")
+        self.period, self._clock, self._sleep = period, clock, sleep
+        self.late, self.missed = 0.0, 0
+        self._due: float | None = None
+
+    def begin(self) -> None:
+        """Begin anew: the next interval is due at once."""
+        self._due = None
+
+    def shift(self, seconds: float | None) -> None:
+        """Move all intervals to come by some time [s]; with None the present moment is when this one was due."""
+        now = self._clock()
+        self._due = now if seconds is None or self._due is None else self._due + seconds
+
+    def wait(self) -> float:
+        """Wait until the next interval is due; by how much it begins late [s]."""
+        now = self._clock()
+        due = now if self._due is None else self._due + self.period
+        if due > now:
+            self._sleep(due - now)
+            now = self._clock()
+        self.late = now - due
+        missed = self.late >= self.period
+        self.missed += missed
+        self._due = now if missed else due
+        return self.late
 
 
 class Operator:
@@ -84,7 +306,7 @@ class Operator:
             order: the order.
             made: its policy, ready to act; None makes it.
         """
-        policy = ready(order, self.policies) if made is None else made
+        policy = order.ready(self.policies) if made is None else made
         if self._order is not None and (self.continuous or self.interval % self.length):
             self.actor.hand_over(policy, strength=order.strength)
         else:
@@ -137,12 +359,12 @@ class Operator:
 
     def fly(self, orders: dict[int, list[Order]]) -> Window:
         """One window, at whose intervals the orders come, by number of the interval since the operation began."""
-        while True:
+        window = None
+        while window is None:
             for order in orders.get(self.interval, ()):
                 self.follow(order)
-            found = self.step()
-            if found is not None:
-                return found
+            window = self.step()
+        return window
 
     def _begin(self) -> None:
         """Begin a window."""
@@ -188,10 +410,10 @@ class Operator:
             for name, kind in (("version", torch.int64), ("late", torch.float64)):
                 self._window[name] = torch.zeros(1, self.length, 1, dtype=kind)
             self._places = [(self._window[key], key) for key in row.keys(True, True)]
-            self._own = self._window["version"], self._window["late"]
+            self._version, self._late = self._window["version"], self._window["late"]
         for place, key in self._places:
             place[:, k] = row[key]
-        self._own[0][:, k], self._own[1][:, k] = self._order.version, 0.0 if self.pace is None else self.pace.late
+        self._version[:, k], self._late[:, k] = self._order.version, 0.0 if self.pace is None else self.pace.late
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on, at the end of a window."""
@@ -224,3 +446,39 @@ class Operator:
     def _can_go_on(self) -> bool:
         """Whether the next window begins in the present state, and this can be put back."""
         return self.continuous and self._begun and isinstance(self.env, PlantEnv)
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Everything that acts, in parts that can be sent to another process.
+
+    Attributes:
+        make_env: function that makes the real system, called in the process that acts.
+        plant: physics of the twin, which gives actuators, ranges and control interval.
+        policies: a policy of each name that an order may have.
+        exploration: parameters of the noise.
+        config: options of the operation.
+        seed: seed of the noise.
+    """
+
+    make_env: Callable[[], EnvBase]
+    plant: Plant
+    policies: dict[str, nn.Module]
+    exploration: ExplorationConfig
+    config: OperationConfig
+    seed: int
+
+    def operator(self, env: EnvBase | None = None) -> Operator:
+        """The operator of the real system.
+
+        Args:
+            env: the real system, if it has been made already.
+        """
+        env = self.make_env() if env is None else env
+        generator = torch.Generator(device=env.device).manual_seed(self.seed)
+        first = next(iter(self.policies.values()))
+        handover = self.config.handover
+        actor = BumplessPolicy(self.plant, first, self.exploration, intervals=handover, generator=generator)
+        paced = self.config.clock == "wall" and getattr(env, "pace", None) is None
+        pace = Pace(self.plant.dt / self.config.speed) if paced else None
+        return Operator(env, actor, self.policies, continuous=self.config.continuous, pace=pace)

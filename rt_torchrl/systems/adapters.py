@@ -1,0 +1,348 @@
+"""Simulators of others as environments: those that call their controller, and FMUs for co-simulation (FMI 2)."""
+
+import contextlib
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal, bounds
+
+Report = Mapping[str, np.ndarray | Sequence[float]]
+Controller = Callable[[Report], np.ndarray]
+Simulation = Callable[[int, Controller], None]
+Start = Callable[[torch.Generator], Mapping[str, float]]
+"""Draws the values that variables of the FMU are set to before an episode, by name."""
+
+
+class EpisodeAbandoned(BaseException):
+    """Ends an episode that nobody goes on with; it is raised where the simulator calls its controller."""
+
+
+class CallingSimulator(EnvBase):
+    """An environment around a simulator that runs whole episodes itself and calls a controller in them.
+
+    Co-simulation, Bladed-style controller libraries and many course codes work like this: ``simulate(seed,
+    controller)`` runs an episode and calls ``action = controller(reported)`` once for every control interval, and a
+    last time at the end of the episode, where the action has no effect any more. Here the simulator runs in a thread
+    that waits until the environment is stepped. :meth:`end_episode` answers a call that waits once more, with the last
+    action, so that a simulator at the end of its episode finishes its work, such as writing results.
+    :class:`RealSystem` calls it at the end of an episode, and so do a reset and :meth:`close`. A simulator that calls
+    again meets :class:`EpisodeAbandoned` in this call and in every further one.
+
+    Args:
+        simulate: the simulator. ``reported`` maps names to the numbers behind them; the action is a vector in double
+            precision.
+        reports: number of values behind each reported name.
+        actions: signals that the controller returns; their ranges become those of the environment's action.
+        seed: seed of the first episode, until ``set_seed`` gives another; each later episode adds 1.
+
+    Raises:
+        ValueError: if ``reports`` or ``actions`` is empty, or a report lacks a name or has another size.
+        RuntimeError: if the simulator fails, an episode never calls the controller, the simulator does not return from
+            an episode that is abandoned, or the environment is stepped while no episode runs: before the first reset,
+            or after an episode has ended or failed.
+    """
+
+    patience = 30.0
+    """Longest time in which a simulator returns from an episode that is abandoned [s]."""
+
+    def __init__(self, simulate: Simulation, reports: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
+        if not reports or not actions:
+            raise ValueError(f"reports={dict(reports)} and actions={list(actions)} must not be empty.")
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self._simulate, self._sizes, self._seed = simulate, dict(reports), seed
+        self._conversation: _Conversation | None = None
+        double = {"dtype": torch.float64}
+        self.observation_spec = Composite({name: Unbounded((n,), **double) for name, n in self._sizes.items()})
+        low, high = bounds(actions)
+        self.action_spec = Bounded(low, high, (len(actions),), **double)
+        self.reward_spec = Unbounded((1,), **double)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = self._seed if seed is None else seed
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        self.end_episode()
+        self._conversation = _Conversation(self._simulate, self._seed)
+        self._action = self.action_spec.zero().numpy()
+        self._seed += 1
+        first = self._conversation.listen()
+        if first is None:
+            raise RuntimeError("the simulator has ended its episode without calling its controller once.")
+        self._last = self._entries(first)
+        return self._last.clone()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step to the next call of the controller; once the simulator has ended, repeat its last report and be done."""
+        if self._conversation is None or self._conversation.ended:
+            raise RuntimeError("no episode is running; reset the environment before it is stepped.")
+        self._action = tensordict["action"].numpy().copy()
+        self._conversation.answer(self._action)
+        reported = self._conversation.listen()
+        if reported is not None:
+            self._last = self._entries(reported)
+        ended = torch.full((1,), reported is None)
+        ends = {"done": ended, "terminated": ended.clone(), "reward": torch.zeros(1, dtype=torch.float64)}
+        return self._last.clone().update(ends)
+
+    def _entries(self, reported: Report) -> TensorDict:
+        entries: dict[str, Tensor] = {}
+        for name, size in self._sizes.items():
+            values = reported.get(name)
+            if values is None or np.shape(values) != (size,):
+                raise ValueError(
+                    f"the simulator reports {name}={values!r}; it must be {size} numbers, as declared in `reports`."
+                )
+            entries[name] = torch.as_tensor(np.asarray(values, dtype=np.float64))
+        return TensorDict(entries, batch_size=self.batch_size)
+
+    def end_episode(self) -> None:
+        """Let the simulator finish its episode, or abandon the rest of it; nothing is done where no episode runs."""
+        conversation, self._conversation = self._conversation, None
+        if conversation is None or conversation.ended:
+            return
+        conversation.answer(self._action)
+        if conversation.listen() is not None:
+            conversation.abandon(self.patience)
+
+    def close(self, **kwargs: Any) -> None:
+        self.end_episode()
+        super().close(**kwargs)
+
+
+class _Conversation:
+    """One episode of a simulator in a thread of its own, whose calls of the controller are answered from this thread.
+
+    ``ended`` is true once the simulator has returned or failed: nobody listens to an answer any more.
+
+    Args:
+        simulate: function that runs the episode.
+        seed: seed of the episode.
+    """
+
+    def __init__(self, simulate: Simulation, seed: int):
+        self._simulate, self._seed, self.ended, self._abandoned = simulate, seed, False, False
+        self._reports: SimpleQueue[Report | BaseException | None] = SimpleQueue()
+        self._actions: SimpleQueue[np.ndarray | None] = SimpleQueue()
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._simulate(self._seed, self._ask)
+        except EpisodeAbandoned:
+            pass
+        except BaseException as error:  # any error goes to the thread that steps, because nobody sees this one
+            self._reports.put(error)
+        self._reports.put(None)
+
+    def _ask(self, reported: Report) -> np.ndarray:
+        action = None
+        if not self._abandoned:
+            self._reports.put(dict(reported))
+            action = self._actions.get()
+        if action is None:
+            raise EpisodeAbandoned
+        return action
+
+    def listen(self) -> Report | None:
+        """The next report of the simulator to its controller; None once the simulator has ended.
+
+        Raises:
+            RuntimeError: if the simulator has failed; the simulator's own error is its cause.
+        """
+        reported = self._reports.get()
+        self.ended = reported is None or isinstance(reported, BaseException)
+        if isinstance(reported, BaseException):
+            raise RuntimeError(f"the simulator failed: {type(reported).__name__}: {reported}") from reported
+        return reported
+
+    def answer(self, action: np.ndarray | None) -> None:
+        """Answer the simulator with the controller's action, or with None to abandon the episode."""
+        self._actions.put(action)
+
+    def abandon(self, patience: float) -> None:
+        """Abandon the rest of the episode and wait for the simulator to return.
+
+        Raises:
+            RuntimeError: if it does not return within ``patience`` [s].
+        """
+        self._abandoned = True
+        self.answer(None)
+        self._thread.join(patience)
+        if self._thread.is_alive():
+            raise RuntimeError(
+                f"the simulator has not returned {patience:g} s after its episode was abandoned; let EpisodeAbandoned, "
+                "which its controller raises then, end it."
+            )
+
+
+class FMUError(RuntimeError):
+    """The FMU has refused a call; the message names the FMU, the call and the time."""
+
+
+class FMUEnvironment(EnvBase):
+    """One FMU that is stepped once in a control interval; it reports ``outputs`` and ``exogenous``.
+
+    :class:`RealSystem` makes it the real system of a plant, with ``state=Reading(keys=("outputs",))`` and
+    ``exogenous=Reading(keys=("exogenous",))``.
+
+    Args:
+        path: the FMU.
+        plant: plant that gives the control interval, the ranges of the actions, and draws the exogenous inputs.
+        actions: variables of the FMU that take the actions, in the plant's order.
+        outputs: variables that are reported.
+        exogenous: variables that take the plant's exogenous inputs, in its order; empty for an FMU that has its own.
+        start: function that draws what variables are set to before an episode; None leaves the FMU's own values.
+        seed: seed of the first episode, until ``set_seed`` gives another; each later episode adds 1.
+
+    Raises:
+        ValueError: if FMPy is not installed, the file is no FMU for co-simulation, or a variable does not exist or the
+            number of variables does not fit the plant.
+        FMUError: in a reset or step that the FMU refuses.
+    """
+
+    observation_spec: Composite
+
+    def __init__(
+        self,
+        path: Path | str,
+        plant: Plant,
+        *,
+        actions: Sequence[str],
+        outputs: Sequence[str],
+        exogenous: Sequence[str] = (),
+        start: Start | None = None,
+        seed: int = 0,
+    ):
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self._fmpy, self.path, self.plant = _fmpy(), Path(path), plant
+        self._description, self._places = self._read()
+        if len(actions) != len(plant.actions):
+            count = len(plant.actions)
+            raise ValueError(f"actions={tuple(actions)} must name {count} variables, one for each of the plant's.")
+        if exogenous and len(exogenous) != len(plant.inputs):
+            raise ValueError(f"exogenous={tuple(exogenous)} must name {len(plant.inputs)} variables, or none.")
+        self._require({"actions": actions, "outputs": outputs, "exogenous": exogenous})
+        self._actions, self._outputs, self._exogenous = tuple(actions), tuple(outputs), tuple(exogenous)
+        self._start, self._seed, self._steps = start, seed, 0
+        self._fmu: Any = None  # FMPy says no types
+        self._folder = self._fmpy.extract(str(self.path))
+        double = {"dtype": torch.float64}
+        reported = {"outputs": Unbounded((len(outputs),), **double)}
+        reported["exogenous"] = Unbounded((len(plant.inputs),), **double)
+        self.observation_spec = Composite(reported)
+        low, high = bounds(plant.actions)
+        self.action_spec = Bounded(low, high, (len(actions),), **double)
+        self.reward_spec = Unbounded((1,), **double)
+
+    def _read(self) -> tuple[Any, dict[str, int]]:
+        try:
+            description = self._fmpy.read_model_description(str(self.path))
+        except Exception as error:  # FMPy raises whatever its parser meets
+            raise ValueError(f"path={self.path} is no FMU that can be read: {error}") from error
+        if description.coSimulation is None or not description.fmiVersion.startswith("2."):
+            raise ValueError(
+                f"path={self.path} is an FMU of FMI {description.fmiVersion}; it must be one of FMI 2 for "
+                "co-simulation."
+            )
+        # Of other types the same references are other variables.
+        real = [variable for variable in description.modelVariables if variable.type == "Real"]
+        return description, {variable.name: variable.valueReference for variable in real}
+
+    def _require(self, names: Mapping[str, Sequence[str]]) -> None:
+        for what, wanted in names.items():
+            unknown = [name for name in wanted if name not in self._places]
+            if unknown:
+                raise ValueError(
+                    f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "
+                    f"{', '.join(self._places)}."
+                )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = self._seed if seed is None else seed
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        generator = torch.Generator().manual_seed(self._seed)
+        self._seed, self._steps = self._seed + 1, 0
+        start = {} if self._start is None else dict(self._start(generator))
+        self._require({"start": list(start)})
+        self._inputs = self.plant.draw_exogenous(1, generator)[0]
+        self._free()
+        instantiate = partial(self._fmpy.simulation.instantiate_fmu, self._folder, self._description, "CoSimulation")
+        fmu = self._fmu = self._call("instantiate", instantiate)
+        self._call("setupExperiment", partial(fmu.setupExperiment, startTime=0.0, stopTime=self.plant.horizon))
+        self._set(start)
+        self._call("enterInitializationMode", fmu.enterInitializationMode)
+        self._set(dict(zip(self._exogenous, self._now().tolist(), strict=False)))
+        self._call("exitInitializationMode", fmu.exitInitializationMode)
+        return self._report()
+
+    def _now(self) -> Float[Tensor, " n_z"]:
+        return self._inputs[min(self._steps, len(self._inputs) - 1)]
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._fmu is None:
+            raise RuntimeError("no episode is running; reset the environment before it is stepped.")
+        values = dict(zip(self._actions, tensordict["action"].tolist(), strict=True))
+        values |= dict(zip(self._exogenous, self._now().tolist(), strict=False))
+        self._set(values)
+        t, dt = self._steps * self.plant.dt, self.plant.dt
+        self._call("doStep", partial(self._fmu.doStep, currentCommunicationPoint=t, communicationStepSize=dt))
+        self._steps += 1
+        ends = {"done": torch.zeros(1, dtype=torch.bool), "terminated": torch.zeros(1, dtype=torch.bool)}
+        return self._report().update(ends | {"reward": torch.zeros(1, dtype=torch.float64)})
+
+    def _set(self, values: Mapping[str, float]) -> None:
+        if values:
+            places = [self._places[name] for name in values]
+            self._call(f"set {', '.join(values)}", partial(self._fmu.setReal, places, list(values.values())))
+
+    def _report(self) -> TensorDict:
+        places = [self._places[name] for name in self._outputs]
+        values = self._call(f"get {', '.join(self._outputs)}", partial(self._fmu.getReal, places))
+        outputs = torch.tensor(list(values), dtype=torch.float64)
+        return TensorDict({"outputs": outputs, "exogenous": self._now().clone()}, batch_size=self.batch_size)
+
+    def _call(self, what: str, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except Exception as error:  # FMPy raises plain exceptions
+            raise FMUError(
+                f"the FMU {self.path.name} refuses to {what} at t = {self._steps * self.plant.dt:g} s: {error}"
+            ) from error
+
+    def _free(self) -> None:
+        """Free the FMU, which need not be able to end its simulation: after an error it may refuse."""
+        fmu, self._fmu = self._fmu, None
+        for call in () if fmu is None else (fmu.terminate, fmu.freeInstance):
+            with contextlib.suppress(Exception):  # nobody uses this instance any more
+                call()
+
+    def close(self, **kwargs: Any) -> None:
+        """Free the FMU and what was unpacked of it."""
+        self._free()
+        shutil.rmtree(self._folder, ignore_errors=True)
+        super().close(**kwargs)
+
+
+def _fmpy() -> Any:
+    try:
+        import fmpy
+        import fmpy.simulation
+    except ImportError as error:
+        raise ValueError("FMUs need FMPy: install the extra, pip install 'rt_torchrl[fmu]'.") from error
+    return fmpy

@@ -1,0 +1,307 @@
+"""A plant at the other end of a link, as an environment that keeps the plant's pace."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.systems.operation.operator import Pace
+
+FRESH = 0.5
+"""Share of the period for which the client waits for a new sample after it was due."""
+LOOKS = 20
+"""Number of looks for a new sample in a period."""
+EARLIER = 0.01
+"""Share of the period by which the next look comes earlier where the sample was there at once; it keeps the phase."""
+TOLERATED = 4
+"""Number of late answers in a row after which a connection counts as lost."""
+AGAIN = 0.05
+"""Time between two attempts to connect [s]."""
+
+
+class LinkLostError(OSError):
+    """The plant does not answer: the connection is lost, or an answer did not come in time."""
+
+
+class LateAnswerError(LinkLostError):
+    """An answer did not come in time; the connection may still be there."""
+
+
+class RefusedRequestError(ValueError):
+    """The plant answers, and refuses: a tag is unknown, may not be written, or does not take the value.
+
+    Another attempt would be refused as well; tags, types or rights must be mended.
+    """
+
+
+@runtime_checkable
+class Link(Protocol):
+    """A connection to a plant's control system. A tag is a named number there.
+
+    All methods but ``connect`` answer within a fraction of the control period, or raise. A tag that the control system
+    marks as not good is NaN; a link may say why in an attribute ``quality``, a text for each tag of the last reading
+    that is not good.
+    """
+
+    def connect(self) -> None:
+        """Connect, or connect again.
+
+        Raises:
+            LinkLostError: if the plant does not answer.
+            RefusedRequestError: if a tag is unknown there, or cannot take a number.
+        """
+
+    def read(self) -> dict[str, float]:
+        """All tags that are read, by name, in one request.
+
+        Raises:
+            LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses.
+        """
+
+    def write(self, values: Mapping[str, float]) -> None:
+        """Write tags, in one request.
+
+        Raises:
+            LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses a value.
+        """
+
+    def close(self) -> None:
+        """Close the connection, if there is one."""
+
+
+class ConnectedPlant(EnvBase):
+    """An environment around a :class:`Link`: it writes commands, waits for the next sample, and reads.
+
+    The plant's clock is the master: where a tag counts samples, the client follows it, and a reading that is no newer
+    than the last one is not passed on as a new one. Where a reading does not come in time, because the connection is
+    lost or the plant has stopped, the entries are NaN until the plant answers again. A safety layer in front of this
+    environment then marks them, and asks for its fallback. The entries are NaN as well after an interval whose command
+    did not get through, because nobody knows what acted in it; a tag that the plant marks as not good is NaN alone. A
+    request that the plant refuses is an error. The entry ``skipped`` is the number of samples between this reading and
+    the last one that nobody read; where it is not zero, a transition is longer than one interval.
+
+    The plant must have a watchdog of its own, which brings its safe action when commands stay out, as
+    :class:`ServedPlant` has. A thread connects again, so that the pace is kept.
+
+    The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
+    readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read. The attribute
+    ``reasons`` says for the tags of the last reading that are NaN, or for all of them, why they are.
+
+    Args:
+        link: connection to the plant.
+        entries: tags behind each entry of the environment, in the order of its components.
+        commands: tags of the commands, one for each action.
+        actions: signals of the actions; their ranges become those of the environment's action.
+        period: control period of the plant [s].
+        sample: tag that counts the samples; None if the plant has none, and then the client's own clock counts.
+        answered: tag that takes the number of the sample that a command answers; None if the plant has none.
+        patience: time for which a reset waits for the plant to answer [s].
+        clock: wall clock [s].
+        sleep: function that waits for some time [s].
+
+    Raises:
+        ValueError: if there are no entries, or not one command for each action, or a time is not positive, or a number
+            is to be answered that nobody counts; in a reset, if the plant does not answer.
+        RefusedRequestError: in a reset or a step, if the plant refuses a request.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        entries: Mapping[str, Sequence[str]],
+        commands: Sequence[str],
+        actions: Sequence[Signal],
+        *,
+        period: float,
+        sample: str | None = None,
+        answered: str | None = None,
+        patience: float = 60.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        if not entries or not actions or len(commands) != len(actions):
+            raise ValueError(
+                f"entries={list(entries)} must not be empty, and commands={list(commands)} must be one tag for each of "
+                f"the actions {[action.name for action in actions]}."
+            )
+        if not patience > 0.0:
+            raise ValueError(f"patience={patience} s must be positive; infinity waits for ever.")
+        if answered is not None and sample is None:
+            raise ValueError(f"answered={answered!r} takes the number of a sample; name the tag that counts, sample.")
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self.link, self.pace = link, Pace(period, clock=clock, sleep=sleep)
+        self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
+        self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
+        self._patience, self._clock, self._sleep = patience, clock, sleep
+        self.losses = self.late = self.stale = self.skipped = 0
+        self._in_a_row = self._gap = 0
+        self._sample, self._connected, self._closing = -math.inf, False, False
+        self.reasons: dict[str, str] = {}
+        self._lost = ""  # why the last request failed
+        self._refused: RefusedRequestError | None = None  # what the plant has refused beside the control loop
+        self._mender: threading.Thread | None = None
+        self._lock = threading.Lock()  # connection and mender change together
+        double = {"dtype": torch.float64}
+        sizes = {key: len(tags) for key, tags in entries.items()} | {"skipped": 1}
+        self.observation_spec = Composite({key: Unbounded((n,), **double) for key, n in sizes.items()})
+        low, high = bounds(tuple(actions))
+        self.action_spec = Bounded(low, high, (len(actions),), **double)
+        self.reward_spec = Unbounded((1,), **double)
+
+    @property
+    def reads_applied(self) -> bool:
+        """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
+        return "applied" in self._entries_of
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Do nothing, because a machine takes no seed."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Connect, if there is no connection, and wait for a sample."""
+        until = self._clock() + self._patience
+        while self._clock() < until:
+            self._require_not_refused()
+            try:
+                with self._lock:
+                    idle = not self._connected and self._mender is None
+                if idle:
+                    self.link.connect()
+                    self._connected = True
+                self.pace.begin()
+                reading = self._fresh() if self._connected else None
+                if reading is not None:
+                    return self._entries(reading)
+            except LinkLostError as lost:
+                self._connected, self._lost = False, str(lost)
+            self._sleep(min(AGAIN, self.pace.period))
+        why = f": {self._lost}" if self._lost else ""
+        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{why}")
+
+    def _require_not_refused(self) -> None:
+        """Raise in the control loop what the plant has refused beside it."""
+        refused, self._refused = self._refused, None
+        if refused is not None:
+            raise refused
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        values = dict(zip(self._commands, tensordict["action"].reshape(-1).tolist(), strict=True))
+        if self._answered is not None:
+            values[self._answered] = self._sample
+        self._require_not_refused()
+        through = self._connected and self._written(values)
+        self.pace.wait()
+        reading = self._fresh() if self._connected else None
+        if not through:
+            reading, self.reasons = None, {"commands": f"not written: {self._lost}"}
+        ends = {"done": torch.zeros(1, dtype=torch.bool), "reward": torch.zeros(1, dtype=torch.float64)}
+        return self._entries(reading).update(ends)
+
+    def _written(self, values: Mapping[str, float]) -> bool:
+        """Write the commands; whether they got through."""
+        try:
+            self.link.write(values)
+        except LinkLostError as error:
+            self._lose(error)
+            return False
+        return True
+
+    def _fresh(self) -> dict[str, float] | None:
+        """A reading newer than the last one; None if none comes in time."""
+        until, looks = self._clock() + FRESH * self.pace.period, 0
+        try:
+            while True:
+                reading = self.link.read()
+                if self._sample_tag is None:
+                    self._in_a_row = 0
+                    return reading
+                sample = reading[self._sample_tag]
+                if math.isfinite(sample) and sample != self._sample:
+                    self._follow(sample, looks)
+                    return reading
+                looks += 1
+                if self._clock() >= until:
+                    self.stale += 1
+                    self.reasons = {"all tags": self._stale_because(sample)}
+                    return None
+                self._sleep(self.pace.period / LOOKS)
+        except LinkLostError as error:
+            self._lose(error)
+            self.reasons = {"all tags": self._lost}
+            return None
+
+    def _stale_because(self, sample: float) -> str:
+        if math.isfinite(sample):
+            return f"sample {sample:.0f} was read before"
+        why = getattr(self.link, "quality", {}).get(self._sample_tag, sample)
+        return f"tag {self._sample_tag} counts no samples: {why}"
+
+    def _follow(self, sample: float, looks: int) -> None:
+        """Keep the phase of the plant's clock: be there when the sample comes, and not long after it."""
+        self._gap = int(sample - self._sample) - 1 if math.isfinite(self._sample) and sample > self._sample else 0
+        self.skipped += self._gap
+        self._sample, self._in_a_row = sample, 0
+        self.pace.shift(-EARLIER * self.pace.period if looks == 0 else None)
+
+    def _entries(self, reading: dict[str, float] | None) -> TensorDict:
+        if reading is not None:
+            quality: Mapping[str, str] = getattr(self.link, "quality", {})
+            used = {tag for tags in self._entries_of.values() for tag in tags}
+            self.reasons = {tag: status for tag, status in quality.items() if tag in used}
+        numbers = {
+            key: [math.nan if reading is None else reading[tag] for tag in tags]
+            for key, tags in self._entries_of.items()
+        }
+        numbers["skipped"], self._gap = [float(self._gap)], 0
+        entries = {key: torch.tensor(values, dtype=torch.float64) for key, values in numbers.items()}
+        return TensorDict(entries, batch_size=self.batch_size)
+
+    def _lose(self, error: LinkLostError) -> None:
+        """Note a late answer, or a lost connection, and then connect again beside the control loop."""
+        self._lost = str(error)
+        if isinstance(error, LateAnswerError):
+            self.late += 1
+            self._in_a_row += 1
+            if self._in_a_row < TOLERATED:
+                return
+        self._in_a_row = 0
+        self.losses += 1
+        with self._lock:
+            self._connected = False
+            if self._mender is None:
+                self._mender = threading.Thread(target=self._mend, daemon=True)
+                self._mender.start()
+
+    def _mend(self) -> None:
+        connected = False
+        while not connected and not self._closing:
+            try:
+                self.link.connect()
+                connected = True
+            except RefusedRequestError as error:
+                self._refused = error  # which the control loop raises
+                break
+            except LinkLostError as error:
+                self._lost = str(error)
+                time.sleep(AGAIN)
+        # Together: a loss right after a new connection finds no mender, and starts the next one.
+        with self._lock:
+            self._connected, self._mender = connected, None
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the connection; the plant's own watchdog then brings its safe action."""
+        self._closing = True
+        mender = self._mender
+        if mender is not None:
+            mender.join()
+        self.link.close()
+        self._connected = False
+        super().close(**kwargs)

@@ -1,0 +1,193 @@
+"""A link over Modbus, by a client of pymodbus that the user prepares."""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rt_torchrl.options import check_options
+from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
+
+WIDTHS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
+"""Number of registers of each type of numbers."""
+MOST = 120
+"""Greatest number of registers in one request."""
+REFUSALS = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure"}
+"""Exceptions by which a server refuses a request; after the others, such as a busy device, it may take the next one."""
+
+
+@dataclass(frozen=True)
+class Register:
+    """A number in the registers of a Modbus device.
+
+    Args:
+        address: address of its first register.
+        kind: type of the number.
+        scale: one unit of the register in the unit of the tag, such as 0.1 for tenths. A command to a register of whole
+            numbers is rounded to this resolution; with a scale of 1 it must be a whole number.
+        word_order: big for the high word first, little for the low one.
+        table: holding for registers that are read and written, input for those that are read alone.
+
+    Raises:
+        ValueError: if an option is none of its choices, the address is negative, or the scale is zero.
+    """
+
+    address: int
+    kind: Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] = "float64"
+    scale: float = 1.0
+    word_order: Literal["big", "little"] = "big"
+    table: Literal["holding", "input"] = "holding"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.address < 0 or self.scale == 0.0:
+            raise ValueError(f"address={self.address} must be 0 or more, and scale={self.scale} must not be zero.")
+
+    @property
+    def width(self) -> int:
+        """Number of registers."""
+        return WIDTHS[self.kind]
+
+    @property
+    def end(self) -> int:
+        """Address behind the last register."""
+        return self.address + self.width
+
+
+class ModbusLink:
+    """A :class:`Link` to a Modbus server.
+
+    Args:
+        client: client of pymodbus, such as ``ModbusTcpClient(host, timeout=0.02, retries=0)``. Its answers must come
+            within a fraction of the control period.
+        read: registers of the tags that are read; those of one table lie beside each other.
+        written: holding registers of the tags that are written, one behind the other.
+        device: number of the device behind the server.
+
+    Raises:
+        ValueError: if the registers do not fit one request, or the written ones have gaps, which a request would
+            overwrite.
+    """
+
+    def __init__(self, client: Any, read: Mapping[str, Register], written: Mapping[str, Register], *, device: int = 1):
+        self._client, self._device, self._joined = client, device, False
+        tables = {register.table for register in read.values()}
+        self._read = {table: {tag: one for tag, one in read.items() if one.table == table} for table in tables}
+        for registers in self._read.values() or [{}]:
+            _require_block("read", registers)
+        self._written = dict(sorted(written.items(), key=lambda item: item[1].address))
+        _require_block("written", written)
+        ordered = list(self._written.values())
+        if any(one.end != two.address for one, two in zip(ordered, ordered[1:], strict=False)) or any(
+            register.table == "input" for register in ordered
+        ):
+            raise ValueError(f"written={dict(written)} must be holding registers one behind the other, without gaps.")
+
+    @property
+    def _address(self) -> str:
+        return f"{self._client.comm_params.host}:{self._client.comm_params.port}"
+
+    def connect(self) -> None:
+        self._client.close()
+        self._joined = False
+        if not self._asked("to connect", self._client.connect):
+            raise LinkLostError(f"{self._address} does not answer.")
+        self._joined = True
+
+    def read(self) -> dict[str, float]:
+        reading = {}
+        for table, registers in self._read.items():
+            first = min(register.address for register in registers.values())
+            count = max(register.end for register in registers.values()) - first
+            request = getattr(self._client, f"read_{table}_registers")
+            what = f"to read {', '.join(registers)}"
+            words = self._asked(what, request, first, count=count, device_id=self._device).registers
+            for tag, register in registers.items():
+                there = words[register.address - first : register.end - first]
+                number = self._client.convert_from_registers(there, self._kind(register), register.word_order)
+                reading[tag] = register.scale * number
+        return reading
+
+    def write(self, values: Mapping[str, float]) -> None:
+        missing = set(self._written) ^ set(values)
+        if missing:
+            raise ValueError(f"one request writes {list(self._written)}; {sorted(missing)} is missing or unknown.")
+        words: list[int] = []
+        for tag, register in self._written.items():
+            words += self._words(tag, register, values[tag])
+        what = "to write " + ", ".join(f"{tag} = {values[tag]:g}" for tag in self._written)
+        first = next(iter(self._written.values())).address
+        self._asked(what, self._client.write_registers, first, words, device_id=self._device)
+
+    def _words(self, tag: str, register: Register, value: float) -> list[int]:
+        """The registers of a command.
+
+        Raises:
+            RefusedRequestError: if it does not fit their type.
+        """
+        number: float = value / register.scale
+        try:
+            if "int" in register.kind:
+                if register.scale == 1.0 and number != round(number):
+                    raise ValueError("it takes whole numbers")
+                number = round(number)
+            words: list[int] = self._client.convert_to_registers(number, self._kind(register), register.word_order)
+        except (ValueError, OverflowError, struct.error) as error:
+            raise RefusedRequestError(f"{tag!r} = {value:g} does not fit {register}: {error}.") from error
+        return words
+
+    def _kind(self, register: Register) -> Any:
+        return self._client.DATATYPE[register.kind.upper()]
+
+    def _asked(self, what: str, request: Any, *arguments: Any, **options: Any) -> Any:
+        """The answer to a request.
+
+        Args:
+            what: the request in words.
+            request: method of the client that makes it.
+            arguments: its arguments, of which the first is the address of the first register.
+            options: more arguments.
+
+        Raises:
+            LinkLostError: if it does not come in time.
+            RefusedRequestError: if the server refuses.
+        """
+        from pymodbus.exceptions import ModbusException, ModbusIOException  # here, because the package is an extra
+
+        try:
+            if self._joined and not self._client.connected and not self._client.connect():
+                raise LinkLostError(f"{self._address} does not answer.")
+            answer = request(*arguments, **options)
+        except ModbusIOException as error:
+            self._client.close()  # an answer that still comes would be taken for that of the next request
+            raise LateAnswerError(f"{self._address}: {error}") from error
+        except (OSError, ModbusException) as error:
+            self._client.close()
+            raise LinkLostError(f"{self._address}: {type(error).__name__}: {error}") from error
+        if isinstance(answer, bool) or not answer.isError():
+            return answer
+        code = getattr(answer, "exception_code", None)
+        if code in REFUSALS:
+            count = options.get("count") or len(arguments[1])
+            raise RefusedRequestError(
+                f"{self._address} refuses {what}, registers {arguments[0]} to {arguments[0] + count - 1}: exception "
+                f"{code}, {REFUSALS[code]}. Mend the addresses, or what the machine lets a client read and write."
+            )
+        raise LateAnswerError(f"{self._address} does not answer {what} now: {answer}")
+
+    def close(self) -> None:
+        self._joined = False
+        self._client.close()
+
+
+def _require_block(what: str, registers: Mapping[str, Register]) -> None:
+    """Refuse registers that do not fit one request."""
+    if not registers:
+        raise ValueError(f"{what}={dict(registers)} must name registers.")
+    first = min(register.address for register in registers.values())
+    count = max(register.end for register in registers.values()) - first
+    if count > MOST:
+        raise ValueError(
+            f"{what} spans {count} registers from {first} on, and one request takes at most {MOST}; let the plant hold "
+            "the tags beside each other."
+        )
