@@ -8,7 +8,7 @@ from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import recipe
-from test_hypotheses import PLANT, Suspecting, ensemble
+from test_hypotheses import Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
@@ -122,20 +122,6 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
     assert hypothesis_lines(one) == ["  beside the twin: lags, weight 0.60"]
 
 
-def test_figures_replay_the_likeliest(run):
-    flown = run.simulate(run.policy(run.live), seed=5)
-    read = flown._replace(states=flown.states[:, :2])
-    believed = run.twin.believed
-    expected = stepped(
-        believed.plant,
-        believed.closure,
-        believed.plant.at_rest(read.states[0]),
-        read.exogenous,
-        lambda k, t, s, w: read.actions[k],
-    )
-    torch.testing.assert_close(run.twin.replayed(read), expected[:, :2], rtol=1e-9, atol=1e-9)
-
-
 @needs_compiler
 def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, monkeypatch):
     export = recipe("export")
@@ -180,11 +166,3 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
         twin.episode_costs(policy, start, z),
         control_cost(twin.believed.plant, twin.believed.control(policy, twin.believed.plant.at_rest(start), z)),
     )
-
-
-def test_a_hypothesis_without_parameters_has_the_closure_of_the_twin():
-    twin, _ = ensemble(PLANT)
-    twin.weights = {"late": 1.0}
-    assert twin.hypothesis == "late" and twin.believed_law is twin.twins["late"].closure
-    twin.weights = {ALONE: 1.0}
-    assert twin.hypothesis is None and twin.believed_law is twin.closure

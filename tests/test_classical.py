@@ -1,6 +1,5 @@
 """Classical controllers: their laws, their flights against the plant's own step, and the search for their gains."""
 
-import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
@@ -10,11 +9,10 @@ from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, Rest
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
-from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import control_cost
 
@@ -92,26 +90,6 @@ def test_a_baseline_that_diverges_does_not_take_the_results():
     assert list(found) == [*ROLES, "PD"]
 
 
-COMPARISON = """
-import sys
-sys.path.insert(0, "tests")
-from test_classical import PD, LinearQuadratic, episodes
-
-plant = LinearQuadratic(horizon=3.0)
-eager, compiled = (PD(plant, compiled=flag).fly(*episodes(plant)) for flag in (False, True))
-assert (eager.states - compiled.states).abs().max() < 1e-13
-assert (eager.actions - compiled.actions).abs().max() < 1e-13
-print("compared")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
-def test_a_compiled_flight_is_the_eager_one():
-    done = fresh_process.run(COMPARISON)
-    assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]
-
-
 def test_tuning_finds_the_riccati_gain():
     # 15 s are some ten time constants of the closed loop: the finite horizon hardly matters.
     plant = LinearQuadratic(noise=0.0, horizon=15.0)
@@ -162,14 +140,6 @@ def test_a_valve_that_rests_at_the_end_is_near_the_limit():
     assert 2.64954 < costs[1] < 1.003 * 2.64954 < 1.03 * 2.64954 < costs[0]
 
 
-def test_the_resting_valve_is_the_usual_one_until_its_rest():
-    plant = CryogenicTank(horizon=6e4)
-    unseen = UnseenEpisodes(plant, 2)
-    usual, rested = (unseen.fly_baseline(kind(plant)).actions for kind in (OnOffValve, RestingOnOff))
-    end = round((6e4 - 43.2e3) / plant.dt)
-    assert torch.equal(usual[:, :end], rested[:, :end]) and usual[:, end:].any() and not rested[:, end:].any()
-
-
 def test_the_integral_of_the_valve_stops_where_the_valve_does():
     plant = CryogenicTank()
     valve, memory = PIValve(plant, (1.0, 1e-3)), torch.zeros(1, 1).double()
@@ -179,9 +149,3 @@ def test_the_integral_of_the_valve_stops_where_the_valve_does():
     assert memory.item() == 200e3 and command.item() == pytest.approx(240e3)
     command, memory = valve.law(high - torch.tensor([0.0, 0.0, 80e3]), memory)
     assert memory.item() == pytest.approx(200e3 - 1e-3 * 40e3 * 30.0)
-
-
-def test_statistics_are_of_the_chosen_episodes():
-    found = Judged(torch.tensor([1.0, 2.0, 9.0]).double(), {"m": torch.tensor([3.0, 5.0, 0.0]).double()})
-    chosen = found.statistics(torch.tensor([True, True, False]))
-    assert chosen["J_a"]["mean"] == 1.5 and chosen["merit"]["m"]["median"] == 3.0

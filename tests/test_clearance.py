@@ -11,7 +11,7 @@ from test_algorithm import twinning
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.runs.real_side import Resting, simulated
+from rt_torchrl.runs.real_side import simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import as_written, config_of
@@ -147,29 +147,3 @@ def test_the_memory_of_the_fallback_goes_on_while_the_policy_acts():
     steps = [k for k, _ in fallback]
     assert len(steps) > 4 and any(later > first + 1 for first, later in zip(steps, steps[1:], strict=False))
     assert dict(fallback) == pytest.approx(acted, rel=1e-12)
-
-
-def test_the_fallback_is_told_the_time_of_the_episode():
-    times = []
-
-    class Clocked(Lagged):
-        def begin(self):
-            times.append("begin")
-            super().begin()
-
-        def act(self, t, state, exogenous):
-            times.append(round(t, 9))
-            return super().act(t, state, exogenous)
-
-    plant = LinearQuadratic(horizon=2.0)
-    controller = Clocked(plant)
-    layer = SafetyLayer(
-        PlantEnv(plant, seed=0),
-        SafetyConfig(interval=plant.dt, limits={"state": ((-9.0, -0.7), (9.0, 0.7))}),
-        fallback=Resting(controller, torch.zeros(1, 1).double(), dt=plant.dt),
-    )
-    for _ in range(2):
-        row = layer.reset()
-        for _ in range(3):
-            row = layer.step_mdp(layer.step(row.set("action", torch.ones(1, 1).double())))
-    assert times == ["begin", 0.0, 0.1, 0.2] * 2

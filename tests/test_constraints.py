@@ -13,7 +13,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.belief import Belief, Judged
+from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ConstraintsConfig, ExogenousConfig
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.inputs import VirtualEpisodes
@@ -118,24 +118,6 @@ def test_a_plan_and_the_policy_that_it_would_replace_have_the_same_price():
         planner.constraints.multipliers = raised
         multipliers += raised
     assert multipliers == sorted(multipliers) and multipliers[-1] - multipliers[5] < 0.1 * multipliers[5]
-
-
-def test_what_is_refused_raises_no_multiplier():
-    """Where a plan and others from wild weights are refused, the policy that stays raises it as much as without."""
-    episodes, raised = from_rest_at(-1.2, -0.6, 0.8, 1.2), []
-    for iterations, others in ((0, ()), (40, ()), (40, (3.0, -0.05))):
-        planner = planner_of()
-        planner.policy.load_state_dict({"gain": torch.tensor([[0.5, 0.5]], dtype=torch.float64)})
-        steps, stays = judged(planner), planner.policy.gain.clone()
-        planner.config = dataclasses.replace(planner.config, iterations=iterations)
-        wild = [{"gain": torch.full((1, 2), gain, dtype=torch.float64)} for gain in others]
-        steps._others, steps.count = lambda *arguments, wild=wild: iter([(1, weights) for weights in wild]), len(wild)
-        dearer = iter([1.0, *[2.0] * 3])  # than what stays
-        steps.belief.judge = lambda policy, on, dearer=dearer: Judged(cost := next(dearer), cost)
-        steps.plan(1, episodes, episodes)
-        assert torch.equal(planner.policy.gain, stays)
-        raised.append(planner.constraints.multipliers)
-    assert raised[0] == raised[1] == raised[2] and raised[0][0] > 0.0
 
 
 def test_results_say_how_often_and_how_far(tmp_path, capsys):

@@ -7,8 +7,7 @@ import torch
 from seeds_and_numbers import double, seeded
 from tensordict.nn import TensorDictModule
 
-from rt_torchrl import PlantEnv, Rollout, SaturatedAffine, check_plant, control_cost
-from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
+from rt_torchrl import PlantEnv, Rollout, check_plant, control_cost
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
@@ -103,15 +102,6 @@ def test_a_duty_cycle_takes_more_heat_per_mass_than_a_half_open_valve():
     assert throttled.heat.item() < 0.97 * half.heat.item()
 
 
-def test_the_classical_valves_command_a_duty_cycle():
-    flights = []
-    for command in ("drop", "duty"):
-        plant = CryogenicTank(horizon=60_000.0, command=command)
-        state, load = plant.draw_initial_state(2, seeded(1)), plant.draw_exogenous(2, seeded(1))
-        flights.append(OnOffValve(plant).fly(state, load).states)
-    torch.testing.assert_close(*flights, rtol=1e-10, atol=1e-10)
-
-
 # Terminal costs
 
 
@@ -182,8 +172,3 @@ def test_an_optimal_vent_goes_on_until_the_end_where_the_end_has_a_price():
         share = double(0.0, 0.5, 1.0).view(3, 1, 1).expand(3, plant.n_steps, 1)
         ends.append(Rollout(plant, plant.closure).costs(state, load, 200e3 * share).argmin().item())
     assert ends == [0, 2]
-
-
-def test_a_policy_of_other_signals_is_affine():
-    plant = CryogenicTank(observe=("clock",))
-    assert isinstance(plant.make_policy(seeded()), SaturatedAffine)

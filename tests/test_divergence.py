@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, RefereeConfig
 from rt_torchrl.steps.report import EpisodeReport, findings
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -144,14 +143,6 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
     assert left == -1 and torch.equal(weights(found.policies["model_based"]), before)
 
 
-def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch):
-    found = twinning()
-    costs = iter(range(100))
-    monkeypatch.setattr(found.belief, "judge", lambda policy, episodes: Judged(float(next(costs)), 1.0))
-    report = found.episode()
-    assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
-
-
 METHODS = [
     AssimilationConfig(iterations=2, segment=0),
     AssimilationConfig(iterations=2, segment=0, method="levenberg_marquardt"),
@@ -184,22 +175,3 @@ def test_a_twin_that_diverges_under_its_first_closure_too_says_so_and_keeps_what
     assert report["J_p_before"].isinf() and report["J_p"].isinf()
     assert all((weight == 1e3).all() for weight in found.twin.closure.parameters())
     assert "twin: J_p diverges, diverges before assimilation" in repr(EpisodeReport(report))
-
-
-def test_a_twin_goes_back_to_its_first_closure_if_the_earlier_one_diverges_too(monkeypatch):
-    found = twinning()
-    first = weights(found.twin.closure).clone()
-    found.episode()
-    unsound(found, monkeypatch, {1})
-    fit = found.steps["assimilate"].fit
-
-    def fitted(records):
-        report = fit(records)
-        step = found.steps["assimilate"]
-        step.closure_before = {name: torch.full_like(w, 1e300) for name, w in step.closure_before.items()}
-        return report
-
-    monkeypatch.setattr(found.steps["assimilate"], "fit", fitted)
-    report = found.episode()
-    assert report["closure_refused"] == 1.0
-    assert torch.equal(weights(found.twin.closure), first)

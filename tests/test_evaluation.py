@@ -176,16 +176,3 @@ def test_the_gap_of_the_engine_that_trains_has_its_name(engine, most, tmp_path, 
     run = small_run(tmp_path, episodes=1, engine=engine)
     gap = run.train()["summary"]["engine_gap"]
     assert seen == {f"gradient/relative gap of {engine} to autograd, short horizon": gap} and gap < most
-
-
-class Frozen(LinearQuadratic):
-    """Nothing depends on weights: the cost is of the time alone."""
-
-    def running_cost(self, t, state, applied, exogenous):
-        return t + 0.0 * state.sum(-1)
-
-
-def test_a_gradient_of_zero_is_the_same_for_all_engines():
-    plant = Frozen()
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    assert engine_gap(plant, plant.make_closure(torch.Generator()), policy, UnseenEpisodes(plant, 2)) == 0.0

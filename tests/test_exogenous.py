@@ -54,7 +54,7 @@ def test_covariance_is_that_of_the_residual():
     torch.testing.assert_close(found.covariance[:6, 0, 0], 4.0 * 0.5**lags, rtol=0, atol=0.4)
 
 
-@pytest.mark.parametrize("n", [8, 9, 100, 1201])
+@pytest.mark.parametrize("n", [8, 1201])
 def test_spectrum_of_the_embedding_is_not_negative(n):
     """The embedding is a covariance: its eigenvalues, the FFT of the circulant, are not negative but for rounding."""
     found = process(autoregressive(n, 0.9, seed=n))
@@ -96,11 +96,6 @@ def test_samples_have_the_mean_of_the_record():
     assert ((means - record.mean(0)).abs() < 5.0 * spread).all()
 
 
-def test_constant_input_stays_constant():
-    found = process(np.full(50, 3.25))
-    assert torch.equal(found.sample(3, seeded()), torch.full((3, 50, 1), 3.25, dtype=torch.float64))
-
-
 def test_samples_are_held_within_the_physical_range():
     signals = (Signal(symbol="u", name="wind_speed", unit="m/s", low=3.0, high=5.0), *FREE)
     values = np.stack([4.0 + autoregressive(300, 0.3), autoregressive(300, 0.3, seed=1)], -1)
@@ -124,8 +119,7 @@ def cross_covariance(found, h):
     return (found.covariance[abs(h)] if h >= 0 else found.covariance[abs(h)].T)[0, 1].item()
 
 
-@pytest.mark.parametrize("correlation", [0.8, -0.5, 0.0])
-@pytest.mark.parametrize("lag", [0, 4])
+@pytest.mark.parametrize("correlation, lag", [(0.8, 0), (-0.5, 4)])
 def test_components_keep_their_correlation(correlation, lag):
     """E ε_0(t + h) ε_1(t) of a known bivariate process; fast beside the knots."""
     found = process(bivariate(14_400, 0.5, lag, correlation), FREE * 2)
@@ -144,14 +138,6 @@ def test_samples_have_the_cross_covariances_of_the_model():
         # Five standard errors of a mean of products, at most √2 of the product of the deviations.
         assert abs(estimate - cross_covariance(found, h)) < 5.0 * math.sqrt(2.0 / count) * size, h
     assert cross_covariance(found, -4) > 0.4 * size > 10.0 * math.sqrt(2.0 / count) * size
-
-
-def test_two_equal_components_stay_equal_and_samples_differ():
-    base = autoregressive(300, 0.3)
-    drawn = process(np.stack([base, base], -1), FREE * 2).sample(3, seeded())
-    # The spectrum is singular: rounding is its root's, 1e-8 of the deviation.
-    torch.testing.assert_close(drawn[..., 0], drawn[..., 1], rtol=0, atol=1e-6)
-    assert not torch.equal(drawn[0], drawn[1])
 
 
 def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():

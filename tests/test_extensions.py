@@ -14,7 +14,6 @@ from rt_torchrl.plants.plant import PARTS, Plant
 from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations, UnreadInput
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import LaggedCoefficients, NeuralResidual, ScaledCoefficients
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 
 DT = 0.1
@@ -85,18 +84,6 @@ def test_hidden_states_follow_the_matrix_exponential(name, A, b):
     for u in command:
         expected.append(zero_order_hold(A, b, u, expected[-1]))
     torch.testing.assert_close(hidden, torch.stack(expected), rtol=1e-12, atol=1e-12)
-
-
-def test_the_mean_of_an_oscillation_is_that_of_a_fine_quadrature():
-    plant = EXTENDED["resonance"]()
-    x = torch.tensor([0.5, -1.0], dtype=torch.float64)
-    asked = torch.tensor([0.8], dtype=torch.float64)
-    mean, _ = plant.respond(x, asked, plant.closure)
-    fine = ResonantActuator(LinearQuadratic(dt=DT / 1000), "force", 3.0, 0.4)
-    positions = [x]
-    for _ in range(1000):
-        positions.append(fine.respond(positions[-1], asked, fine.closure)[1])
-    torch.testing.assert_close(mean[0], torch.trapezoid(torch.stack(positions)[:, 0]) / 1000, rtol=1e-6, atol=0.0)
 
 
 def test_a_delay_gives_what_was_asked_for_earlier():
@@ -184,14 +171,6 @@ def test_a_biased_sensor_changes_what_is_read_and_not_what_happens():
     torch.testing.assert_close(flown.states[..., 1], expected.states[..., 1], rtol=1e-12, atol=1e-12)
     costs = Rollout(plant, plant.closure).costs(state, exogenous, command)
     torch.testing.assert_close(costs, Rollout(base, base.closure).costs(true, exogenous, command))
-
-
-def test_an_environment_hides_what_no_sensor_reads():
-    plant = EXTENDED["nested"]()
-    env = PlantEnv(plant)
-    assert env.reset()["state"].shape == (1, 2)
-    assert env.rollout(3)["next", "state"].shape == (1, 3, 2)
-    assert [signal.name for signal in plant.readings] == ["position", "velocity"]
 
 
 class Particular(LinearQuadratic):

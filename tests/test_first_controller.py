@@ -52,15 +52,6 @@ def test_it_acts_as_it_flies():
         assert acting._memory.unique().tolist() == [plant.n_steps]
 
 
-def test_it_flies_the_physics_that_it_is_given():
-    plant, other = LinearQuadratic(horizon=1.0), LinearQuadratic(horizon=1.0)
-    other._B = 2.0 * other._B
-    acting, (state, exogenous) = PD(plant, GAINS), episodes(plant)
-    own, others = acting.fly(state, exogenous), acting.fly(state, exogenous, plant=other)
-    wanted = PD(other, GAINS).fly(state, exogenous)
-    assert torch.equal(others.states, wanted.states) and not torch.equal(others.states, own.states)
-
-
 def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
     found = twinning()
     closure = found.twin.closure.matrix.detach().clone()
@@ -128,10 +119,6 @@ def test_a_run_begins_with_the_controller_once(tmp_path):
         metrics["summary"]["unseen"]["baselines"].keys() == {"PD"}
         and len(metrics["summary"]["unseen"]["costs"]["PD"]) == 3
     )
-
-
-def test_a_run_begins_at_random_without_being_asked(tmp_path):
-    assert "start_cost" not in run(tmp_path).train()["episodes"][0]
 
 
 def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):

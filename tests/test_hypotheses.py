@@ -1,26 +1,22 @@
 """Several twins side by side: what each finds, how they are weighed, and what is planned on them."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from small_runs import SMALL
 from tensordict import TensorDict
 
 from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
-from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, progress, twin_entries
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, counting, evidence, make_assimilation
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble, make_twin
-from rt_torchrl.steps.hypotheses.fit import AGAIN, FIRST, Reread, misfit, reread, with_hidden_states
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
+from rt_torchrl.steps.hypotheses.fit import Reread, misfit, reread, with_hidden_states
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -113,49 +109,6 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
     torch.testing.assert_close(flown[:, 2], hidden.states[:, 2], rtol=1e-12, atol=1e-12)
 
 
-def watched(fit):
-    """The stages of every run of a fit."""
-    stages, run = [], fit._run
-    fit._run = lambda records, names, generator: stages.append(names) or run(records, names, generator)
-    return stages
-
-
-def test_a_hypothesis_whose_weights_explode_on_a_record_is_fitted_anew():
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
-    (record, _), fit, least = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"], 1e-3
-    fit.least, stages = least, watched(fit)
-    with torch.no_grad():
-        fit.twin.closure.base.matrix.fill_(300.0)
-    assert 1e20 < misfit(fit.twin, [record], fit.segment) < float("inf")
-    found = fit.update([record], torch.Generator())
-    assert stages == [AGAIN, FIRST]
-    assert found == fit.least == misfit(fit.twin, [record], fit.segment) < least
-
-
-@pytest.mark.parametrize("better", [True, False])
-def test_what_a_fit_anew_has_found_stays_if_it_is_better(better):
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
-    fit = assimilation.fits["lags"]
-    costs = {AGAIN: 100.0, FIRST: 50.0 if better else 200.0}
-
-    def run(records, names, generator):
-        fit.twin.closure.base.matrix.data.fill_(costs[names])
-        return costs[names], False
-
-    fit._run, fit.least = run, 1.0
-    assert fit.update([], torch.Generator()) == (50.0 if better else 100.0)
-    assert (fit.twin.closure.base.matrix == (50.0 if better else 100.0)).all()
-
-
-def test_a_fit_that_has_arrived_goes_over_segments_once_and_not_anew():
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
-    (record, _), fit = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"]
-    stages = watched(fit)
-    fit.least *= 1e-9
-    fit.update([record], torch.Generator())
-    assert stages == [AGAIN]
-
-
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
     twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
     assert twin.weights == {"lags": 1.0} and twin.likeliest == "lags"
@@ -208,13 +161,6 @@ def test_a_believed_twin_that_diverges_on_the_records_says_so():
     assert progress(record).startswith("RMS position diverges, velocity diverges, J_a mb not computed, real 1,")
 
 
-def test_a_twin_alone_is_reported_as_it_always_was():
-    twin, assimilation = fitted(PLANT, PLANT)
-    twin.weights = {ALONE: 1.0}
-    assert not {"believed", "J_p", "J_p_before"} & assimilation.report().keys()
-    assert twin_entries(twin) == {"closure": named_weights(twin.closure), "believed": None}
-
-
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
     twin, _ = fitted(PLANT, PLANT)
     policy = LinearGain([[1.0, 1.0]])
@@ -252,21 +198,6 @@ def test_the_results_say_what_the_twin_lacks():
     assert found["late"] == {"weight": 0.3, "weights": {}, "described": {}}
     lines = hypothesis_lines(found)
     assert lines == ["  beside the twin: lags, weight 0.60, force_lag = 0.2 s", "  beside the twin: late, weight 0.30"]
-
-
-def test_the_results_say_what_all_nested_extensions_have_found():
-    swinging = ResonantActuator(PLANT, "force", 3.0, 0.5)
-    late = DelayedActuator(LaggedActuator(swinging, "force", LAG), "force", 0.2)
-    closures = {"all of it": late.make_closure(torch.Generator())}
-    twin = TwinEnsemble(PLANT, PLANT.closure, {"all of it": late}, closures)
-    twin.weights = {"all of it": 1.0}
-    found = hypotheses_of(twin)["all of it"]
-    assert found["weights"] == pytest.approx({"force_frequency": 3.0, "force_damping_odds": 1.0, "force_lag": LAG})
-    assert {name: about["unit"] for name, about in found["described"].items()} == {
-        "force_frequency": "rad/s",
-        "force_damping_odds": "-",
-        "force_lag": "s",
-    }
 
 
 def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
@@ -372,11 +303,6 @@ def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
 
 
-def test_an_ensemble_of_ones_own_is_weighed():
-    own = TwinEnsemble(PLANT, PLANT.closure, {"late": PLANT.suspects()["late"]}, {"late": PLANT.closure})
-    assert make_assimilation(own, ASSIMILATION, HypothesesConfig()).ensemble is own
-
-
 def test_the_state_is_kept():
     """What goes on from it makes the same of the next record, in as many rounds."""
     twin, assimilation = ensemble(PLANT, call=0.05)
@@ -408,37 +334,3 @@ def test_hypotheses_are_chosen_by_name():
     assert list(twin.twins) == [ALONE, "late"]
     assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which=("none",)))) is DigitalTwin
     assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is DigitalTwin
-
-
-@pytest.mark.parametrize("which", ["none", "late"])
-def test_options_are_those_of_the_algorithm(which, tmp_path):
-    """They reach the twin and its step 4 through a run."""
-    hypotheses = HypothesesConfig(which=(which,), call=0.02)
-    twinning = dataclasses.replace(SMALL, hypotheses=hypotheses)
-    options = {"compiled": False, "unseen": 2, "figures": False, "twinning": twinning}
-    algorithm = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=2.0)).algorithm
-    assert isinstance(algorithm.twin, TwinEnsemble) == (which == "late")
-    if which == "late":
-        assert list(algorithm.twin.twins) == [ALONE, "late"]
-        assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called
-
-
-@pytest.mark.slow
-def test_a_run_shows_the_twin_that_is_believed(tmp_path, capsys):
-    """In the metrics of each episode, on the dashboard and on the terminal."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    known = Suspecting(horizon=4.0)
-    twinning = dataclasses.replace(
-        SMALL, arm="model_based", assimilation=ASSIMILATION, hypotheses=HypothesesConfig(call=0.0, which=("lags",))
-    )
-    options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
-    run = Run(RunConfig(log_dir=tmp_path, **options), LaggedActuator(known, "force", LAG), believed=known)
-    (episode,) = run.train()["episodes"]
-    lagged, record = run.algorithm.twin.twins["lags"], run.algorithm.short_term[-1]
-    assert episode["believed"] == "lags" and episode["closure"] == named_weights(lagged.closure.base)
-    assert episode["J_p"] == pytest.approx(whole_cost(lagged, record), rel=1e-6)
-    events = EventAccumulator(str(tmp_path)).Reload()
-    assert [event.value for event in events.Scalars("twin/J_p after assimilation")] == pytest.approx([episode["J_p"]])
-    assert events.Tensors("believed/text_summary")[0].tensor_proto.string_val == [b"lags"]
-    assert "episode 1: the twin with 'lags' is the likeliest" in capsys.readouterr().out

@@ -2,22 +2,20 @@
 
 import json
 import math
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from straight_line import Line, Slope, flown, line_segment, noise_of
+from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
 
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures import uncertainty as charts
-from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
 from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.resampling import filled, hold_out, initial_spread, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
@@ -126,20 +124,6 @@ def test_the_oracle_plant_is_identified_from_a_jittered_log(identified):
     assert (found.autocorrelation < 0.5).all() and (found.autocorrelation > 0.0).all()
 
 
-def test_figures_show_the_log_the_twin_and_what_was_held_out(identified):
-    plant, _, (training, held_out), found = identified
-    figure = charts.twin_and_sensors(found)
-    ax = figure.axes[0]
-    drawn = np.concatenate([line.get_ydata() for line in ax.lines if line.get_label() == "read"])
-    expected = torch.cat([record.readings[:, 0] for record in (*training, *held_out)]).numpy()
-    np.testing.assert_array_equal(drawn, expected)
-    shaded = ax.patches[0].get_extents().transformed(ax.transData.inverted())
-    end = held_out[0].start + plant.dt * len(held_out[0].actions)
-    assert (shaded.x0, shaded.x1) == pytest.approx((held_out[0].start, end))
-    bars = charts.weights(found.estimate).axes[0]
-    assert [label.get_text() for label in bars.get_xticklabels()] == list(found.estimate.after)
-
-
 def test_actions_that_the_actuators_would_not_apply_are_told():
     held_back, plant = recipe("identify").held_back, WindTurbine(horizon=20.0)
     (segment,) = flown(plant, torch.Generator().manual_seed(0), (40,))
@@ -151,16 +135,6 @@ def test_actions_that_the_actuators_would_not_apply_are_told():
     # later the remembered pitch is 10 deg behind in every interval.
     share = held_back(plant, [Trajectory(states, jump, exogenous)])
     assert share["generator_torque"] == 0.0 and share["blade_pitch"] == pytest.approx(0.5, abs=0.13)
-
-
-def test_correlation_of_residuals():
-    record = sensor_record(Line(), state_sensors(Line()), line_segment(noise_of(5000, 0, smooth=True)))
-    closure = Slope()
-    torch.nn.init.zeros_(closure.w)
-    likelihood = Estimation(DigitalTwin(Line(), closure), state_sensors(Line()), spread=torch.zeros(1).double())
-    # Means of neighbours share one of two numbers: 1/2, with a scatter of 1/√5000; the first sample is the start.
-    record = record._replace(guess=torch.zeros(1).double())
-    assert autocorrelation(likelihood.likelihood([record])).item() == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_twin_that_diverges_at_the_start_is_told():
@@ -314,14 +288,6 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tm
     with pytest.raises(ValueError, match=rf"log_dir={tmp_path} holds results already.*{name}.*choose another folder"):
         config.make_folder("wind_turbine")
     assert (tmp_path / name).read_text() == "kept" and [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_identifications_within_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(time, "strftime", lambda *_: "20260101-000000")
-    config = recipe("identify").Config(log=tmp_path / "log.csv", plant="wind_turbine")
-    folders = [config.make_folder("wind_turbine") for _ in range(3)]
-    assert len(set(folders)) == 3 and all((folder / "figures").is_dir() for folder in folders)
 
 
 @pytest.mark.parametrize(

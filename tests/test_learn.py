@@ -279,15 +279,6 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
     assert "reason" not in other.update() and not torch.equal(other.policy.gain, before[1]["gain"])
 
 
-def test_the_iteration_with_a_target_that_is_not_finite_is_named():
-    found = learner(critic_iterations=3, actor_iterations=0)
-    filled(explored(20), found)
-    with torch.no_grad():
-        for weight in found.critic_adam.weights:
-            weight.fill_(torch.nan)
-    assert "of critic iteration 1 is not finite" in found.update()["reason"]
-
-
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt, FloatingPointError])
 def test_small_operations_run_on_one_thread_of_torch(algorithm, error, monkeypatch):
@@ -384,27 +375,6 @@ def test_restart_forgets_the_moments_of_the_policys_optimiser():
     torch.testing.assert_close((found.policy.gain - before).abs(), torch.full((1, 2), 0.01).double(), rtol=1e-4, atol=0)
 
 
-def test_the_lower_of_two_targets_at_the_delayed_policys_smoothed_action():
-    """TD3: max_i |r + γ min_j q_j′(e′, π′(e′) + ε) − q_i(e, a)| by hand, with the noise of TorchRL's draw."""
-    found, data = learner("td3", target_rate=0.3, critic_iterations=20), scaled(explored(10))
-    filled(explored(10), found)
-    found.update()
-    first = data[:6].clone()
-    following, reward = first["next", "observation"], first["next", "reward"]
-    gain = found.loss.target_actor_network_params.flatten_keys(".")["module.policy.gain"].detach()
-    assert not torch.equal(gain, found.policy.gain)
-    state = found.generator.get_state()
-    errors = found.td_errors(first)
-    found.generator.set_state(state)
-    torch.manual_seed(torch.randint(2**31, (), generator=found.generator).item())
-    noise = (0.2 * torch.randn_like(first["action"])).clamp(-0.5, 0.5)
-    with torch.no_grad():
-        action = (LinearGain(gain)(following) / HALF_RANGE + noise).clamp(-1.0, 1.0)
-        y = reward + GAMMA_IN_TORCHRL * values(found, following, action, target=True).amin(0)
-        expected = (y - values(found, first["observation"], first["action"])).abs().amax(0)[:, 0]
-    torch.testing.assert_close(errors, expected, rtol=1e-10, atol=1e-12)
-
-
 @pytest.mark.parametrize("algorithm", ["td3", "sac"])
 def test_all_is_drawn_from_the_learners_generator(algorithm):
     errors = []
@@ -415,11 +385,6 @@ def test_all_is_drawn_from_the_learners_generator(algorithm):
         errors.append(found.td_errors(data))
         assert torch.equal(state, torch.get_rng_state())
     assert torch.equal(*errors)
-
-
-def test_the_critics_start_apart():
-    data = scaled(explored(4))
-    assert not torch.equal(*values(learner("td3"), data["observation"], data["action"]))
 
 
 @pytest.mark.parametrize(
@@ -465,13 +430,6 @@ def episode(n):
 
 def summing(return_steps, discount=0.5, **options):
     return learner(return_steps=return_steps, discount=discount, critic_hidden=(8,), **options)
-
-
-def test_one_step_is_the_transition_itself():
-    found = summing(1).transitions(episode(4))
-    assert found["next", "reward"].flatten().tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert found["next", "observation"][:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert "state" not in found
 
 
 def test_rewards_are_summed_over_whole_windows_only():
@@ -560,13 +518,6 @@ def test_refreshed_errors_change_the_sampling(monkeypatch):
     assert (found.sample(200)["label"] == 2.0).all()
 
 
-def test_index_of_a_sample_is_its_place():
-    found = memory()
-    found.store(labelled([4.0, 5.0, 6.0]), torch.ones(3))
-    batch = found.sample(50)
-    assert torch.equal(batch["label"], 4.0 + batch["index"])
-
-
 def test_eviction_goes_by_the_present_priorities():
     """Errors rank one way at first and the other way after a refresh; the transitions that are now least go first."""
     found = memory(capacity=6)
@@ -588,14 +539,6 @@ def test_filling_up_in_the_middle_of_an_episode():
     found.store(labelled([3.0, 4.0, 5.0, 6.0]), torch.full((4,), 0.5))
     # Two free places and the two of least priority, 1 and 2.
     assert labels(found) == [0.0, 3.0, 4.0, 5.0, 6.0]
-
-
-def test_filling_up_one_by_one():
-    """An episode as long as its returns has one transition."""
-    found = memory(capacity=2)
-    for label in (0.0, 1.0, 2.0):
-        found.store(labelled([label]), torch.tensor([3.0 - label]))
-    assert labels(found) == [0.0, 2.0]
 
 
 def test_state_round_trip_samples_the_same():

@@ -10,10 +10,9 @@ from linear_quadratic import LinearQuadratic
 from test_export_recipe import recipe
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.log import Column, SensorLog, checked, converted, logged_signals, read_log
+from rt_torchrl.fit.log import Column, SensorLog, checked, converted, read_log
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -229,11 +228,6 @@ def test_the_turbine_completes_its_filters():
         plant.complete_states({}, wind[0], flown.actions[0])
 
 
-def test_remembered_actions_have_no_column_of_their_own():
-    names = [signal.name for signal in logged_signals(WindTurbine(horizon=10.0))]
-    assert names.count("generator_torque") == names.count("blade_pitch") == 1
-
-
 def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
     """The plant's own steps, without inputs; its noisy angles are read again, and in range."""
     plant = Pendulum()
@@ -262,23 +256,6 @@ def test_the_recorder_steps_as_a_tank_with_a_light_wall_does():
         flown = Rollout(plant, plant.closure, policy)(start, load)
     for k, state in enumerate(plant.states):
         np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=1e-9)
-
-
-def test_a_recorder_without_jitter_writes_the_plants_own_trajectory():
-    plant = FlappingWing(horizon=0.02)
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    log = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(1))
-    generator = torch.Generator().manual_seed(1)
-    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, policy)(start, wind)
-    # The same steps, with Δt as the difference of two times.
-    for k, state in enumerate(plant.states):
-        np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=1e-10, atol=1e-14)
-    np.testing.assert_allclose(log.columns["headwind"][:-1], wind[0, :, 0].numpy())
-    for option in ("jitter", "noise"):
-        with pytest.raises(ValueError, match=f"{option}=1.0"):
-            recorded(plant, policy_law(plant, policy), generator, **{option: 1.0})
 
 
 def test_jitter_and_noise_are_as_large_as_asked():

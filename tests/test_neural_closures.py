@@ -1,9 +1,6 @@
 """Closures with a perceptron in them: their start, the bounds that keep their physics, their identification."""
 
 import copy
-import importlib.util
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +15,6 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
-from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.engines.interval import Interval
@@ -26,7 +22,6 @@ from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise
 from rt_torchrl.trajectories.rollout import drive_of
 from rt_torchrl.trajectories.twin import DigitalTwin, jacobians_of
 
-RECIPE = Path(__file__).parent.parent / "recipes" / "wind_turbine.py"
 PLANTS = [WindTurbine(horizon=20.0), FlappingWing(horizon=0.01), CryogenicTank(horizon=1200.0)]
 RANGES = {
     "wind_turbine": ((3.0, 12.0), (0.0, 20.0)),
@@ -98,35 +93,6 @@ def test_jacobians_by_rows_are_those_by_columns(plant):
     assert ((columns - rows).abs().amax((0, 2)) <= 1e-10 * columns.abs().amax((0, 2)).clamp(min=1e-300)).all()
 
 
-def test_segments_start_from_the_record(plant):
-    """J_p of the segments is the mean over them, each flown here from its measured state at its own time."""
-    twin, flown, exogenous = recorded(plant, batch=2)
-    config = AssimilationConfig(segment=8, inputs="record", method="levenberg_marquardt", iterations=1)
-    assimilation, seen = Assimilation(twin, config), []
-    likelihood = assimilation.likelihood
-
-    def noted(*arguments, **options):
-        made = likelihood(*arguments, **options)
-        seen.append(made.normal_equations())
-        return made
-
-    assimilation.likelihood = noted
-    records = flown.each()
-    costs, n = [], plant.n_steps // 8 * 8
-    with torch.no_grad():
-        for record in records:
-            for first in range(0, n, 8):
-                state, total = record.states[first], 0.0
-                for k in range(first, first + 8):
-                    t = torch.tensor(k * plant.dt, dtype=torch.float64)
-                    state = plant.step(t, state, record.actions[k], record.exogenous[k], twin.closure).state
-                    total = total + plant.dt * plant.discrepancy(state, record.states[k + 1])
-                costs.append(total)
-    assimilation.update(records, [], 1, seeded())
-    # Rounding of at most eight steps.
-    assert seen[0].cost.item() == pytest.approx(torch.stack(costs).mean().item(), rel=1e-9)
-
-
 class Corrected(nn.Module):
     """The law that a twin starts from and a perceptron of one layer."""
 
@@ -176,16 +142,6 @@ def test_a_prior_pulls_to_the_closure_that_a_training_begins_with_and_goes_on_do
             torch.testing.assert_close(weight, torch.full_like(weight, 0.3), rtol=0, atol=1e-4)
 
 
-def test_a_prior_leaves_the_law_free():
-    plant = LinearQuadratic(horizon=4.0, noise=0.0)
-    twin, flown, exogenous = recorded(plant, batch=1)
-    twin = DigitalTwin(plant, Corrected(twin.closure))
-    config = AssimilationConfig(prior=1e6, inputs="record", method="levenberg_marquardt", iterations=30)
-    Assimilation(twin, config).update([flown.each()[0]], [], 1, seeded())
-    # With the perceptron held, the law finds the true matrix as it does alone.
-    torch.testing.assert_close(twin.closure.law.matrix, plant.closure.matrix, rtol=0, atol=1e-4)
-
-
 def test_a_segment_longer_than_the_record_is_refused():
     twin, flown, exogenous = recorded(LinearQuadratic(horizon=2.0), batch=1)
     record = flown.each()[0]
@@ -205,26 +161,3 @@ def test_the_error_where_visited_is_that_of_the_coefficients():
     error = (closure(features) - plant.closure(features)).square().mean().sqrt()
     assert rms_error(closure, plant.closure, features).tolist() == pytest.approx([error.item()], rel=1e-12)
     assert rms_error(plant.closure, plant.closure, features).tolist() == [0.0]
-
-
-def load_recipe():
-    spec = importlib.util.spec_from_file_location("recipe_wind_turbine", RECIPE)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
-    """An option that is given keeps its value: here the number of records."""
-    recipe, seen = load_recipe(), []
-    for options in ([], ["--closure", "mlp"], ["--closure", "mlp", "--twinning.records", "3"]):
-        monkeypatch.setattr("sys.argv", ["wind_turbine.py", "--start", "random", *options])
-        main_of(recipe.Config, seen.append)
-    default, neural, chosen = (config.twinning for config in seen)
-    assert default == recipe.DEFAULT and neural == recipe.NEURAL != default
-    assert chosen.records == 3 and chosen.assimilation == neural.assimilation
-    assert [type(c.make_closure(PLANTS[0], seeded())).__name__ for c in seen[:2]] == [
-        "SaintDrenan",
-        "NeuralPowerCoefficient",
-    ]

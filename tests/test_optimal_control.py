@@ -6,18 +6,13 @@ import torch
 from linear_quadratic import LinearQuadratic
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, descend, projected_gradient
 from rt_torchrl.control.forecasts import Foreseen
 from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
-from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_start
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.systems.config import SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import constant
@@ -42,17 +37,6 @@ class PricedEnd(LinearQuadratic):
 
     def terminal_cost(self, state):
         return self.price * state.square().sum(-1)
-
-
-class TwoWays(LinearQuadratic):
-    """Each force has two minima, −1.5 and 1, of which the second one is worse and shallow.
-
-    Its slope is (a + 1.5)(a − 0.8)(a − 1).
-    """
-
-    def running_cost(self, t, state, action, exogenous):
-        a = action[..., 0]
-        return a**4 / 4 - 0.1 * a**3 - 0.95 * a**2 + 1.2 * a + 2.334375
 
 
 def quadratic_program(plant, s_0, z):
@@ -97,41 +81,6 @@ def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
     torch.testing.assert_close(found.costs, control_cost(plant, found.flown))
 
 
-def test_the_second_descent_leaves_a_shallow_minimum():
-    plant = TwoWays(horizon=2.0)
-    state, exogenous = episodes(plant, 2)
-    both = torch.where(torch.arange(plant.n_steps) % 2 == 0, -1.5, 1.0).double()[:, None].expand(2, -1, -1)
-    found = clairvoyant(plant, state, exogenous, {"both": both})
-    shallow = 1 / 4 - 0.1 - 0.95 + 1.2 + 2.334375
-    torch.testing.assert_close(found.first_costs["both"], torch.full((2,), shallow / 2).double(), rtol=1e-6, atol=0)
-    assert found.costs.max() < 1e-6 * shallow
-    assert found.spread(first=True)["both"] > found.spread()["both"] == 0.0
-
-
-def test_held_commands_cost_more_than_free_ones_and_change_only_between_blocks():
-    plant = LinearQuadratic(horizon=4.0, noise=0.5)
-    state, exogenous = episodes(plant, 2)
-    starts = constant_starts(plant, 2, plant.n_steps)
-    free, held = (clairvoyant(plant, state, exogenous, starts, hold=hold) for hold in (1, 7))
-    assert (held.costs > free.costs).all()
-    blocks = held.flown.actions[:, :35].reshape(2, 5, 7)
-    assert (blocks == blocks[:, :, :1]).all() and blocks[0, 0, 0] != blocks[0, 1, 0]
-
-
-def test_a_descent_uses_one_thread_for_its_scalar_products():
-    """Two threads wait for each other in each of thousands of products; beside other work that takes milliseconds."""
-    threads = set()
-
-    def evaluate(point):
-        threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
-        return float(np.square(point - 0.3).sum()), 2.0 * (point - 0.3)
-
-    with threadpool_limits(2, "blas"):
-        found = descend(evaluate, np.full((1, 5), 0.9), BoundedDescentConfig())
-    np.testing.assert_allclose(found.point, 0.3, atol=1e-6)
-    assert threads == {1, 2}  # the cost at the start is taken outside
-
-
 def test_starts_that_diverge_are_reported():
     plant = LinearQuadratic(horizon=1.0)
     state, exogenous = episodes(plant, 2)
@@ -141,18 +90,6 @@ def test_starts_that_diverge_are_reported():
     assert found.start_costs["nowhere"].isinf().all() and found.start_costs["middle"].isfinite().all()
     with pytest.raises(DivergenceError, match="diverges from every start: nowhere"):
         clairvoyant(plant, state, exogenous, {"nowhere": nowhere})
-
-
-def test_rate_limits_leave_starts_that_agree():
-    plant = WindTurbine(horizon=60.0)
-    state, exogenous = episodes(plant, 2)
-    state = plant.draw_initial_state(2, torch.Generator().manual_seed(0))
-    starts = {"Jonkman": JonkmanController(plant).fly(state, exogenous).actions}
-    starts |= constant_starts(plant, 2, plant.n_steps)
-    found = clairvoyant(plant, state, exogenous, starts)
-    assert max(found.spread().values()) < 1e-3 and found.excess < 1e-3
-    assert all((found.start_costs[name] <= found.first_costs[name]).all() for name in starts)
-    assert found.costs.mean() < 0.5 * control_cost(plant, JonkmanController(plant).fly(state, exogenous)).mean()
 
 
 def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
@@ -184,17 +121,6 @@ def test_a_plan_of_a_whole_episode_with_a_preview_is_the_clairvoyant_optimum():
         assert cost == pytest.approx(wanted, rel=1e-6)
 
 
-def test_acting_interval_by_interval_is_flying():
-    plant = LinearQuadratic(horizon=2.0, noise=0.5)
-    state, exogenous = episodes(plant, 2)
-    controller = RecedingHorizon(plant, plant.closure, PredictiveConfig(horizon=1.0, period=0.4, hold=0.2))
-    flown = controller.fly(state, exogenous)
-    controller.begin()
-    for k in range(plant.n_steps):
-        command = controller.act(k * plant.dt, flown.states[:, k], exogenous[:, k])
-        torch.testing.assert_close(command, flown.actions[:, k], rtol=1e-9, atol=1e-9)
-
-
 def test_late_solves_leave_the_last_plan():
     plant = LinearQuadratic(horizon=2.0, noise=0.5)
     state, exogenous = episodes(plant, 1)
@@ -208,25 +134,6 @@ def test_late_solves_leave_the_last_plan():
     late.begin()
     late.plan(0.0, state, exogenous[:, 0])
     assert not late.solves[-1].late  # there is no plan to go on with
-
-
-def test_it_acts_on_a_real_system_behind_a_safety_layer_in_time():
-    plant = LinearQuadratic(horizon=3.0, noise=0.5)
-    config = SafetyConfig(interval=plant.dt, deadline=5.0, rates=(100.0,))
-    system = SafetyLayer(PlantEnv(plant, seed=4), config, fallback=(0.0,))
-    controller = RecedingHorizon(plant, plant.closure, PredictiveConfig(horizon=1.0, deadline=5.0))
-    entries = system.reset()
-    start, states, inputs, applied = entries["state"], [], [], []
-    for k in range(plant.n_steps):
-        inputs.append(entries["exogenous"])
-        entries["action"] = controller.act(k * plant.dt, entries["state"], entries["exogenous"])
-        entries = system.step(entries)["next"]
-        states.append(entries["state"])
-        applied.append(entries["applied"])
-    assert not system.reports[-1].events and not any(solve.late for solve in controller.solves)
-    flown = controller.fly(start, torch.stack(inputs, 1))
-    torch.testing.assert_close(flown.states[:, 1:], torch.stack(states, 1), rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(flown.actions, torch.stack(applied, 1), rtol=1e-9, atol=1e-9)
 
 
 class RateLimited(LinearQuadratic):
@@ -288,20 +195,6 @@ def test_the_optimum_is_that_of_a_quadratic_program_in_the_rates():
         limited += (np.abs(np.diff(actions, prepend=0.0)) > plant.step_limit - 1e-9).sum()
     assert limited > 20
     assert max(found.spread().values()) < 5e-6 and found.excess < 1e-4 and found.gradient.max() < 1e-4
-
-
-def test_no_episode_ends_above_its_start():
-    plant = RateLimited(horizon=4.0, noise=0.5)
-    state, exogenous = limited_episodes(plant, 2)
-    best = torch.stack(
-        [
-            torch.from_numpy(program(plant, state[k, :2].numpy(), exogenous[k, :, 0].numpy())[0]).unsqueeze(-1)
-            for k in range(2)
-        ]
-    )
-    config = BoundedDescentConfig(iterations=10)  # one for each charge, which leaves the optimum
-    found = clairvoyant(plant, state, exogenous, {"best": best}, config=config)
-    assert (found.costs <= Rollout(plant, plant.closure).costs(state, exogenous, best) + 1e-12).all()
 
 
 def test_the_gradient_is_that_of_central_differences_before_and_after_a_charge():
@@ -378,16 +271,6 @@ def test_commands_beyond_a_rate_limit_have_a_gradient():
     # The torque of the second interval is within its limit; all others are beyond.
     assert (gradients[0.0][0][0] == 0.0).all() and gradients[0.0][0][1, 1] == 0.0
     assert (gradients[1.0][0] > 0.0).all()
-
-
-def test_commands_and_units_are_each_others_inverse():
-    plant = WindTurbine()
-    cost = CommandCost(plant, constant(plant.closure), hold=3)
-    unit = np.random.default_rng(1).random((2, 4, 2))
-    commands = cost.commands(unit, 11)
-    assert commands.shape == (2, 11, 2)
-    np.testing.assert_allclose(commands[:, 2, 0].numpy(), 43_093.55 * unit[:, 0, 0], rtol=1e-14)
-    np.testing.assert_allclose(cost.units(commands), unit, atol=1e-15)
 
 
 def test_a_cost_without_finite_ranges_is_refused():

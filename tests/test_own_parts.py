@@ -2,13 +2,12 @@
 
 import dataclasses
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from linear_quadratic import LinearGain, LinearQuadratic
 from test_classical import PD
 from torch import nn
 
@@ -23,11 +22,8 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.contract.check import require_controller
-from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.runs.results import next_steps
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import SPREAD_OF_IMITATION
-from rt_torchrl.trajectories.engines.parallel import without_warnings_of_libraries
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -163,27 +159,6 @@ def test_a_policy_that_nobody_makes_is_refused():
     assert isinstance(AnyPolicy(policy="mlp").make_policy(PLANT, torch.Generator()), nn.Module)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WithController(RunConfig):
-    start: str = "controller"
-
-
-def test_the_command_line_of_an_own_recipe_explores_as_its_start_asks():
-    found = from_command_line(WithController, []).twinning
-    assert found.exploration.spread == SPREAD_OF_IMITATION
-    asked = from_command_line(WithController, ["--twinning.exploration.spread", "0.3"]).twinning
-    assert asked.exploration.spread == 0.3
-    random = from_command_line(WithController, ["--start", "random"]).twinning
-    assert random == RunConfig().twinning
-
-
-def test_the_check_hides_the_warnings_of_libraries_alone():
-    with warnings.catch_warnings(record=True) as shown, without_warnings_of_libraries():
-        warnings.warn("`torch.jit.script` is deprecated. Please switch.", FutureWarning, stacklevel=1)
-        warnings.warn("`mine` is deprecated.", FutureWarning, stacklevel=1)
-    assert [str(one.message) for one in shown] == ["`mine` is deprecated."]
-
-
 class WrongNeural(LinearQuadratic):
     def make_neural_closure(self, generator, hidden):
         return BoundedPerceptron([(-1.0, 1.0)] * 7, [0.1], hidden=hidden, generator=generator)
@@ -203,20 +178,58 @@ def test_the_check_finds_what_a_training_would_find_late(kind, message):
         check_plant(kind(horizon=2.0), steps=5, traced=False)
 
 
-class Twins(LinearQuadratic):
-    def make_neural_closure(self, generator, hidden):
-        return LinearClosure(self.true_closure)
+# Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.
 
 
-def test_a_neural_closure_that_fits_passes():
-    assert check_plant(Twins(horizon=2.0), steps=5, traced=False).plant == Twins.name
+class Held(torch.nn.Module):
+    """A policy that always asks for the same action."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def forward(self, observation):
+        return self.action
 
 
-def test_the_next_step_of_a_plant_without_a_recipe_is_one_that_works(tmp_path):
-    metrics = {
-        "summary": {"unseen": {"J_a_model_based": {"mean": 1.0}, "baselines": {}}}
-        | {"live": "model_based", "better": "model_based"}
-    }
-    alone, made = (next_steps(metrics, tmp_path, config) for config in (RunConfig(), None))
-    assert "plant=...)" in alone and "export_controller(run.policy('model_based')" in alone
-    assert "recipes/export.py" in made and "plant=" not in made
+def noise(plant, n=40_000, *, strength=1.0, **options):
+    """Actions that noise makes of a policy that asks for mid-range, as shares of half the range."""
+    middle = torch.tensor([0.5 * (a.low + a.high) for a in plant.actions], dtype=torch.float64)
+    config = ExplorationConfig(spread=0.1, **options)
+    actor = LivePolicy(plant, Held(middle), config, generator=torch.Generator().manual_seed(0))
+    actor.begin(actor.policy, strength=strength)
+    observation = torch.zeros(len(plant.observations), dtype=torch.float64)
+    acted = torch.stack([actor(observation) for _ in range(n)])
+    half = torch.tensor([0.5 * (a.high - a.low) for a in plant.actions], dtype=torch.float64)
+    return (acted - middle) / half
+
+
+@pytest.mark.parametrize("intervals", [0.0, 3.0])
+def test_deviation_and_correlation_are_those_asked_for(intervals):
+    plant = LinearQuadratic()
+    found = noise(plant, correlation_time=intervals * plant.dt, strength=0.5)
+    rho = math.exp(-1.0 / intervals) if intervals else 0.0
+    # Standard error of a deviation over 40 000 samples of which some 1 + 2ρ/(1 − ρ) count as one: 2 % at most.
+    assert found.std(0).tolist() == pytest.approx([0.05] * len(plant.actions), rel=0.05)
+    for lag in (1, 2, 5):
+        correlation = (found[lag:] * found[:-lag]).mean(0) / found.square().mean(0)
+        assert correlation.tolist() == pytest.approx([rho**lag] * len(plant.actions), abs=0.04)
+
+
+def test_an_episode_does_not_begin_with_the_noise_of_the_last_one():
+    plant = LinearQuadratic()
+    config = ExplorationConfig(correlation_time=1e6 * plant.dt, spread=0.1)
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    actor = LivePolicy(plant, policy, config, generator=torch.Generator().manual_seed(0))
+    observation = torch.zeros(len(plant.observations), dtype=torch.float64)
+    firsts = []
+    for _ in range(2):
+        actor.begin(policy, strength=1.0)
+        firsts.append(actor(observation))
+        torch.testing.assert_close(actor(observation), firsts[-1], rtol=0, atol=1e-2)
+    assert (firsts[0] - firsts[1]).abs().min() > 1e-2
+
+
+def test_the_strength_falls_to_zero():
+    assert [ExplorationConfig(episodes=4).strength(episode) for episode in range(6)] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    assert ExplorationConfig(episodes=0).strength(9) == 0.0

@@ -12,13 +12,14 @@ from rt_torchrl.runs.settings import module_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SHORT = {"wind_turbine": 20.0, "flapping_wing": 0.05, "cryogenic_tank": 3000.0}
+PLANTS = ["wind_turbine", *(pytest.param(name, marks=pytest.mark.slow) for name in SHORT if name != "wind_turbine")]
 ITERATIONS = ("--twinning.learner.critic-iterations", "70", "--twinning.learner.actor-iterations", "60")
 WORDS = ("--preset", "paper", "--seed", "3", "--unseen", "2", "--untrained", "0", "--no-figures", *ITERATIONS)
 REFEREE = ("--twinning.referee.patience", "0", "--twinning.referee.clone-patience", "0")
 
 
 @pytest.mark.parametrize("referee", [(), REFEREE], ids=["few episodes", "at once"])
-@pytest.mark.parametrize("plant", SHORT)
+@pytest.mark.parametrize("plant", PLANTS)
 def test_the_recipe_and_the_preset_are_one_algorithm(plant, referee, tmp_path):
     """Over episodes with and without exploration, a change of roles and a clone."""
     recipe, count = load_recipe(RECIPES / f"{plant}.py"), "4" if referee else "2"
@@ -40,9 +41,7 @@ def test_it_is_one_screen_with_three_options():
     assert list(module_of(RECIPES / "paper.py").Config.__dataclass_fields__) == ["plant", "seed", "episodes"]
 
 
-@pytest.mark.parametrize(
-    "plant", [pytest.param(name, marks=pytest.mark.slow) for name in SHORT if name != "wind_turbine"] + ["wind_turbine"]
-)
+@pytest.mark.parametrize("plant", PLANTS)
 def test_the_figures_of_the_paper_are_drawn_beside_its_numbers(plant, tmp_path, monkeypatch, capsys):
     recipe = module_of(RECIPES / "paper_figures.py")
     short = ("--horizon", str(SHORT[plant]), "--episodes", "2", "--unseen", "3", "--untrained", "0", *ITERATIONS)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from pathlib import Path
 
 import fresh_process
@@ -22,9 +21,8 @@ from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, senso
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 recorded = recipe("record_log").recorded
@@ -96,12 +94,6 @@ def test_the_real_system_reports_gymnasiums_reward_and_starts():
     assert states[0, 1].abs() <= 1.0
 
 
-def test_wrapped_is_the_short_way_round():
-    angles = torch.tensor([0.0, 3.0, 3.5, -3.5, 7.0, -100.0], dtype=torch.float64)
-    found = wrapped(angles)
-    torch.testing.assert_close(found, torch.atan2(angles.sin(), angles.cos()), rtol=0, atol=1e-13)
-
-
 def a_record(plant, seed):
     """One episode of Gymnasium's pendulum under an untrained policy and exploration."""
     generator = seeded(seed)
@@ -144,58 +136,6 @@ def test_mass_and_length_follow_from_a_log_that_passes_the_seam():
     # Noise of 0.2 % of angles up to π and speeds up to 8; a turn would stand out by 2π over √60.
     assert (found.training[1].rms < 0.02).all() and (found.held_out[1].rms < 0.05).all()
     assert found.autocorrelation.abs().max() < 0.6
-
-
-def test_engines_agree_without_inputs():
-    """The exact gradients of three engines on a plant that has no exogenous input."""
-    plant, gradients = Pendulum(horizon=1.0), []
-    state, nothing = plant.draw_initial_state(3, seeded()), plant.draw_exogenous(3, seeded())
-    for engine in ("parallel", "autograd"):
-        policy, closure = plant.make_policy(seeded(1)), plant.make_closure(seeded())
-        flown = Rollout(plant, closure, policy, engine=engine)(state, nothing)
-        weights = [*closure.parameters(), *policy.parameters()]
-        found = torch.autograd.grad(control_cost(plant, flown).mean(), weights)
-        gradients.append(torch.cat([part.flatten() for part in found]))
-    *others, exact = gradients
-    for other in others:
-        torch.testing.assert_close(other, exact, rtol=1e-9, atol=1e-12)  # rounding
-
-
-COMPILED = """
-import sys, torch
-sys.path.insert(0, "tests")
-from test_pendulum import Pendulum, Rollout, control_cost, seeded
-
-plant = Pendulum(horizon=0.25)
-# A window of a short horizon has a start for each realisation; lengths and numbers of realisations both change.
-for n, batch, start in ((5, 1, 0.0), (4, 3, 0.0), (3, 5, torch.arange(5.0).double())):
-    gradients = []
-    for compiled in (False, True):
-        rollout = Rollout(plant, plant.closure, plant.make_policy(seeded()), compiled=compiled)
-        state, nothing = plant.draw_initial_state(batch, seeded()), torch.zeros(batch, n, 0).double()
-        cost = control_cost(plant, rollout(state, nothing, start=start)).mean()
-        found = torch.autograd.grad(cost, list(rollout.interval.policy.parameters()))
-        gradients.append(torch.cat([part.flatten() for part in found]))
-    # The same sums in another order.
-    assert (gradients[0] - gradients[1]).norm() < 1e-11 * gradients[0].norm(), (n, batch)
-print("compared")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
-def test_compiled_gradients_of_several_shapes_are_the_eager_ones():
-    """The test runs in a process of its own, because annotations that are checked at run time cannot be compiled."""
-    done = fresh_process.run(COMPILED)
-    assert done.stdout.strip() == "compared", done.stderr[-3000:]
-
-
-def require_quiet(done):
-    """Nothing is on the terminal but what the run itself says: on the error stream its first line and its bar."""
-    first, *lines = [line for line in done.stderr.replace("\r", "\n").splitlines() if line.strip()]
-    assert first == "loading PyTorch and TorchRL"
-    assert lines and all("episode" in line and "|" in line for line in lines), done.stderr[:3000]
-    assert not re.search(r"torch\.jit|CUDA_HOME|\[torchrl\]|Warning", done.stdout), done.stdout
 
 
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)])

@@ -91,13 +91,6 @@ def test_what_has_flown_comes_back_where_the_present_weights_are_refuted():
         assert said(policy) == kept and ("recalled" in report) == corrects
 
 
-def test_luck_recalls_nothing():
-    """An earlier policy, of which the twin says 4, flew for 0.54; the present one for what the twin says."""
-    policy = LinearGain([[2.0, 0.0]])
-    multi_start(policy, belief_of((4.0, -2.0), (2.0, 0.0))).plan(3, EPISODES, EPISODES)
-    assert said(policy) == 2.0
-
-
 def test_weights_before_an_imitation_are_a_start():
     policy = LinearGain([[2.5, 0.0]])
     planning = multi_start(policy, belief_of())
@@ -124,13 +117,6 @@ def test_the_cheapest_of_all_random_policies_is_a_start(monkeypatch):
     planning.plan(2, EPISODES, EPISODES)
     random = [gain for gain in seen if gain >= 4.0]
     assert len(set(random)) == 8 and planning.planner.begun == [3.0, min(random)]
-
-
-def test_what_is_not_trained_is_not_drawn():
-    policy = LinearGain([[3.0, 0.0]])
-    planning = multi_start(policy, belief_of(), lambda generator: LinearGain([[2.0, 0.0]]))
-    policy.gain.requires_grad_(False)
-    assert planning._random(4, EPISODES)["gain"].tolist() == [[3.0, 0.0]]
 
 
 def test_policies_of_another_architecture_are_refused():
@@ -281,16 +267,6 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
     monkeypatch.setattr(found.virtual, "judge", judged)
     found.start()
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies
-
-
-def test_the_copy_that_plans_over_a_short_horizon_goes_on():
-    planner = PlannerConfig(method="short_horizon", window=5, iterations=1, realisations=2)
-    found = twinning(arm="model_based", planner=planner)
-    reports = [found.episode() for _ in range(2)]
-    assert all("start" not in report for report in reports)
-    assert not torch.equal(weights(found.planner.learner), weights(found.policies["model_based"])) or all(
-        report["plan_accepted"] for report in reports
-    )
 
 
 def test_the_papers_rule_keeps_plans_by_the_twin_and_every_update():

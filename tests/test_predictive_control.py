@@ -11,14 +11,14 @@ from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
 from test_optimal_control import matrices
 
-from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
+from rt_torchrl.control.forecasts import Decaying, Foreseen, Held, Scattered
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -151,12 +151,6 @@ def test_the_deadline_does_not_reach_simulated_episodes():
     assert torch.equal(late.actions, early.actions)
 
 
-def test_commands_along_another_flight_are_its_own_in_these_states():
-    controller, (state, exogenous) = control(), episodes()
-    flown = controller.fly(state, exogenous)
-    torch.testing.assert_close(commands_along(controller, flown, PLANT.dt), flown.actions, rtol=1e-9, atol=1e-9)
-
-
 class Fragile(LinearQuadratic):
     """A plant that diverges where it is pushed to the right, from a position on."""
 
@@ -203,11 +197,6 @@ def first_order(time, dt, *, episodes=40, n=4000):
     for k in range(1, n):
         values.append(q * values[-1] + math.sqrt(1.0 - q * q) * noise[:, k])
     return 2.0 + torch.stack(values, 1)
-
-
-def test_a_held_forecast_is_what_is_measured():
-    assert isinstance(Held(), Forecast)
-    torch.testing.assert_close(Held()(7.0, NOW, 3)[:, 0], torch.stack([NOW] * 3, 1), rtol=0.0, atol=0.0)
 
 
 def test_a_decaying_forecast_goes_to_the_mean():
@@ -334,14 +323,6 @@ def test_futures_have_the_moments_of_the_errors():
     torch.testing.assert_close(futures[:, :5] - middle.unsqueeze(1), spread[:5, :, None].expand(4, -1, -1, -1))
     one = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=1).deviations[0, :, 0].numpy()
     assert one @ moments @ one / (one @ one) == pytest.approx(np.linalg.eigvalsh(moments)[-1])
-
-
-def test_futures_stay_in_the_range_of_the_records_and_begin_with_what_is_measured():
-    records = PLANT.draw_exogenous(3, torch.Generator().manual_seed(0)).cumsum(1)
-    found = Scattered.fitted(Held(), records, dt=PLANT.dt, horizon=1.0, pairs=2)
-    futures = found(0.0, records.amax().reshape(1, 1), 30)
-    assert futures.amax() == records.amax() and futures.amin() >= records.amin()
-    assert (futures[:, :, 0] == records.amax()).all() and (futures[:, :, 11:] == futures[:, :, 10:11]).all()
 
 
 def test_it_acts_as_a_policy_whose_scatter_is_learned_and_kept():

@@ -13,8 +13,6 @@ from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.figures.policy import policy_contours
-from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
@@ -187,24 +185,6 @@ def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path):
             export.main(export.Config(run=tmp_path, what=(what,), formats=("c",)))
     export.main(export.Config(run=tmp_path, role="model_free", formats=("pt2",)))
     assert (tmp_path / "exported" / "linear_quadratic_model_free.pt2").is_file()
-
-
-def test_its_panel_says_that_it_has_no_contours(tmp_path):
-    run = training(tmp_path, 1)
-    run.algorithm.episode()
-    figure = policy_contours(run._snapshot())
-    texts = [text.get_text() for ax in figure.axes for text in ax.texts]
-    assert texts == ["plans its actions:\nno function of the observation"]
-    run._held.release()
-
-
-def test_a_checkpoint_of_another_method_does_not_fit(tmp_path):
-    training(tmp_path, 1).train()
-    config = Config(episodes=1, log_dir=tmp_path / "other", compiled=False, twinning=SMALL)
-    other = Run(config, config.plant())
-    with pytest.raises(ValueError, match="do not fit"):
-        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", other.algorithm)
-    other._held.release()
 
 
 def test_methods_and_policies_that_do_not_go_together_are_refused():

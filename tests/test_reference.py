@@ -66,14 +66,6 @@ def test_a_run_states_the_limit_beside_the_optimum_of_its_class(tmp_path, config
     assert line in results_table(metrics) and "model predictive control" in results_table(metrics)
 
 
-def test_without_episodes_the_limit_is_left_out(tmp_path):
-    options = {"episodes": 1, "unseen": 2, "untrained": 0, "figures": False, "reference": True, "limit_episodes": 0}
-    plant = LinearQuadratic(horizon=1.0)
-    Run(Known(log_dir=tmp_path / "run", compiled=False, twinning=SMALL, **options), plant).train()
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["summary"]["reference"]
-    assert "limit" not in found
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -85,13 +77,6 @@ def test_without_episodes_the_limit_is_left_out(tmp_path):
 def test_impossible_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Known(**options)
-
-
-def test_the_first_episodes_are_those_of_all():
-    episodes = UnseenEpisodes(LinearQuadratic(horizon=1.0), 5)
-    few = episodes.first(3)
-    assert (few.initial_state == episodes.initial_state[:3]).all() and len(episodes.initial_state) == 5
-    assert (few.exogenous == episodes.exogenous[:3]).all() and few.closure is episodes.closure
 
 
 @pytest.mark.parametrize(("horizon", "expected"), [(20.0, 8.0), (5.3, 5.0), (1.0, 1.0)])
@@ -169,12 +154,6 @@ def test_solves_have_the_recipes_window_with_what_is_asked_for():
     assert found == dataclasses.replace(window, horizon=8.0, iterations=60, tolerance=1e-6)
 
 
-@pytest.mark.parametrize("option", [{"plant": "wind_turbine"}, {"horizon": 15.0}])
-def test_a_run_is_not_mixed_with_a_plant(option, tmp_path):
-    with pytest.raises(ValueError, match="run has a plant and a horizon of its own"):
-        recipe("limit").Config(run=tmp_path, **option)
-
-
 def test_results_are_standard_json(tmp_path):
     """Numbers that are not finite are null, and paths are text."""
     content = {"config": BoundedDescentConfig(), "costs": (1.5, math.inf, math.nan), "folder": tmp_path, "none": None}
@@ -211,10 +190,3 @@ def test_impossible_options_of_the_recipe_are_refused(option):
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"{name}={value}"):
         recipe("limit").Config(**option)
-
-
-def test_a_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path):
-    (tmp_path / "file").write_text("")
-    module = recipe("limit")
-    with pytest.raises(ValueError, match="folder=.*file/below cannot be made"):
-        module.main(module.Config(folder=tmp_path / "file" / "below"))

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hidden_wall import Room, room_records
 from linear_quadratic import LinearClosure, LinearQuadratic
+from small_plants import Room, room_records
 from test_log import PLANT, jittered, signals
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -63,17 +63,6 @@ def test_held_signals_are_averaged_over_the_interval():
     np.testing.assert_allclose(found, held, atol=8e-3)
     whole = hold_means(times, values, np.array([0.0, times[-1]]))[0]
     assert whole == pytest.approx((values[:-1] * np.diff(times)).sum() / times[-1], rel=1e-12)
-
-
-def test_a_regular_log_is_taken_as_it_is():
-    n = 40
-    values = np.random.default_rng(2).normal(size=(2, n))
-    log = signals(5.0 + 0.1 * np.arange(n), position=values[0], force=values[1])
-    (segment,) = resample(log, PLANT).segments
-    assert segment.start == 5.0
-    # Rounding of the times.
-    np.testing.assert_allclose(segment.states[:, 0].numpy(), values[0], atol=1e-11)
-    np.testing.assert_allclose(segment.actions[:, 0].numpy(), values[1, :-1], atol=1e-11)
 
 
 def test_gaps_split_and_short_parts_are_left_out_and_told():
@@ -146,12 +135,6 @@ def test_a_time_in_another_unit_is_refused_before_memory_is_taken(unit, monkeypa
         resample(signals(0.1 * unit * np.arange(236)), PLANT)
 
 
-def test_a_slow_log_is_still_taken():
-    """Twenty control intervals between rows are what a slow sensor gives."""
-    (segment,) = resample(signals(2.0 * np.arange(20)), PLANT).segments
-    assert len(segment.actions) == 380
-
-
 def test_previews_follow_from_the_input_and_need_no_column():
     plant = WindTurbine(horizon=20.0, observe=("preview",))
     wind, rows = 8.0 + 0.1 * np.arange(41), {"generator_torque": 2e4, "blade_pitch": 0.0, "rotor_speed": 1.0}
@@ -187,12 +170,6 @@ def test_hidden_states_are_those_that_the_plant_cannot_complete(kind, states, hi
     assert hidden_states(plant, log) == hidden
     free = [state.name for state, s in zip(plant.states, initial_spread(plant, log), strict=True) if s > 0.0]
     assert sorted(free) == sorted(unknown or [*states, *hidden])
-
-
-def test_the_drones_last_angle_is_that_of_the_record():
-    plant = FlappingWing(stroke_plane_rate=3000.0)
-    log = log_of(plant, ["forward_position", "height"])
-    assert hidden_states(plant, log) == ["forward_speed", "climb_speed"] and initial_spread(plant, log)[4] == 0.0
 
 
 def test_samples_between_rows_that_are_too_far_apart_are_missing():
@@ -240,7 +217,7 @@ def room_log(tmp_path):
     rows = {"time": 300.0 * np.arange(200), "air": record.readings[:200, 0]}
     rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:, 0]}
     pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
-    text = (TESTS / "hidden_wall.py").read_text()
+    text = (TESTS / "small_plants.py").read_text()
     made = "    def make_closure(self, generator):\n        return Envelope(torch.tensor([30.0, 150.0, 8.0]))\n\n"
     text = text.replace(
         "    observe = running_cost = draw_exogenous = make_closure = None", made + "    observe = None"
@@ -324,26 +301,6 @@ def test_a_training_that_begins_with_a_slow_log_compares_its_rows_alone(options)
     torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-3)
     short = reread(record, plant, 12).exogenous[:, -1]
     assert short.nonzero().flatten().tolist() == [0, *(10 * math.ceil(k * 1.2) for k in range(1, 49))]
-
-
-def test_errors_of_a_slow_log_are_those_of_its_rows():
-    """Neighbours of which each is the mean of two noises: as many rows in between without a sample change nothing."""
-    plant, log = slow_log()
-    smooth = 0.01 * np.convolve(np.random.default_rng(0).normal(size=241), [1.0, 1.0], "valid")
-    log.columns["position"] += smooth - smooth[0]
-    found = []
-    for every in (10, 5):  # control intervals between rows
-        own = LinearQuadratic(dt=1.0 / every, horizon=240.0)
-        parts, sensors = resample(log, own), sensors_in(own, log, ["position"])
-        record = logged_readings(log, own, sensors, parts.segments[0], parts.gap)
-        closure = LinearClosure(torch.tensor(own.true_closure))
-        closure.matrix.requires_grad_(True)
-        config = EstimationConfig(errors="robust")
-        estimate = Estimation(DigitalTwin(own, closure), sensors, config=config).run([record])
-        found.append([estimate.uncertainty.covariance.diagonal()[-2:].sqrt(), autocorrelation(estimate.likelihood)])
-    # The two grids integrate the same system, to fourth order.
-    torch.testing.assert_close(found[0], found[1], rtol=0.02, atol=0)
-    assert 0.25 < found[0][1].item() < 0.6  # half, of the part of the noise that is smooth
 
 
 def test_samples_are_not_interpolated_across_rows_that_were_left_out():

@@ -5,20 +5,17 @@ import math
 import numpy as np
 import pytest
 import torch
-from hidden_wall import Envelope, room_records
-from interval_coverage import CASES, CURVES, LOGS, coverage, covered, curves_of, logged_coverage
-from linear_quadratic import LinearClosure, LinearQuadratic
-from straight_line import Line, Slope, flown, line_segment, noise_of
+from interval_coverage import CASES, CURVES, LOGS, coverage, curves_of, logged_coverage
+from linear_quadratic import LinearClosure
+from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
 from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values, newey_west
-from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 ROBUST = EstimationConfig(errors="robust")
@@ -59,12 +56,6 @@ def test_errors_and_correlations_are_those_of_regression():
     assert found.correlations()[0, 1].item() == pytest.approx(C[0, 1] / math.sqrt(C[0, 0] * C[1, 1]))
     low, high = found.intervals(0.95)["w[0]"]
     assert (high - low) / 2.0 == pytest.approx(1.959964 * math.sqrt(C[0, 0]))
-
-
-def test_robust_errors_see_that_neighbours_are_alike():
-    """Means of neighbours have half the variance of white noise, but sums of them the same: 81 samples, 10 draws."""
-    robust = line_estimate(smooth=True, config=ROBUST).uncertainty.weights_covariance[0, 0].sqrt().item()
-    assert robust == pytest.approx(math.sqrt(exact_covariance()[0, 0]), rel=0.5)
 
 
 class InUnits(Slope):
@@ -123,54 +114,6 @@ def test_the_band_of_a_line_is_that_of_regression():
     features = np.stack([np.ones(7), x.numpy()], -1)
     deviation = np.sqrt(np.einsum("pi,ij,pj->p", features, exact_covariance(), features))
     np.testing.assert_allclose(0.5 * (drawn.high - drawn.low).numpy(), 1.959964 * deviation, rtol=1e-5)
-    assert covered(drawn, drawn.middle) == 1.0 and covered(drawn, drawn.high + 1.0) == 0.0
-
-
-class Curve(nn.Module):
-    """ẋ = g(z), a perceptron."""
-
-    def __init__(self, seed):
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.net = BoundedPerceptron([(-3.0, 3.0), (-1.0, 1.0)], [3.0], hidden=(6,), generator=generator)
-
-    def forward(self, features):
-        return self.net(torch.cat([features, torch.zeros_like(features)], -1))
-
-
-def curve_estimate(seed):
-    """A perceptron that learns ẋ = sin z from records in constant winds between −2 and 2."""
-    generator, sensors, records = torch.Generator().manual_seed(seed), position(0.02), []
-    for z in torch.linspace(-2.0, 2.0, 9).tolist():
-        values = math.sin(z) * torch.from_numpy(TIMES[:21]) + 0.02 * torch.randn(21, generator=generator).double()
-        records.append(sensor_record(Line(), sensors, line_segment(values.numpy(), wind=z)))
-    twin = DigitalTwin(Line(), Curve(seed))
-    return Estimation(twin, sensors, config=EstimationConfig(iterations=40, prior=None)).run(records)
-
-
-@pytest.mark.slow
-def test_the_band_of_a_perceptron_widens_where_no_data_was():
-    found = curve_estimate(0)
-    x = torch.linspace(-3.0, 3.0, 61).double()
-    drawn = band(found.uncertainty, x, x[:, None])
-    width, inside = drawn.high - drawn.low, x.abs() <= 2.0
-    assert width[~inside].max() > 3.0 * width[inside].max()
-    # One draw of the noise: the nightly check counts many.
-    assert covered(band(found.uncertainty, x[inside], x[inside][:, None]), x[inside].sin()) > 0.7
-    assert 1e-6 < found.stiffness < 1e8 and found.stiffness != 1.0
-
-
-def test_the_figure_of_correlations_names_every_value():
-    plant, sensors, records = room_records(lengths=(150,))
-    closure = Envelope(Envelope.true().coefficients)
-    found = Estimation(DigitalTwin(plant, closure), sensors).run(records).uncertainty
-    shown = charts.correlations(found).axes[0]
-    assert [label.get_text() for label in shown.get_xticklabels()] == list(Envelope.names)
-
-
-def test_a_level_beyond_its_range_is_refused():
-    with pytest.raises(ValueError, match="level=1.0"):
-        line_estimate().uncertainty.intervals(1.0)
 
 
 def regression_error(n, dt, *, smooth):
@@ -196,26 +139,6 @@ def test_standard_errors_are_those_of_regression(smooth):
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
     # that in the error; the window takes another few per cent of the correlation and of the trend.
     assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
-
-
-def test_scatter_over_logs_is_the_standard_error():
-    """Monte Carlo on the oracle plant: noise drawn anew, weights fitted anew."""
-    plant = LinearQuadratic(horizon=4.0)
-    sensors = state_sensors(plant)
-    (clean,) = flown(plant, torch.Generator().manual_seed(0), (40,))
-    estimates, errors = [], []
-    for seed in range(12):
-        generator = torch.Generator().manual_seed(100 + seed)
-        noise = 0.02 * torch.randn(clean.states.shape, generator=generator, dtype=torch.float64)
-        record = sensor_record(plant, sensors, clean._replace(states=clean.states + noise, start=0.0))
-        closure = LinearClosure(plant.true_closure)
-        found = Estimation(DigitalTwin(plant, closure), sensors, config=ROBUST).run([record])
-        estimates.append(closure.matrix.detach().flatten().clone())
-        errors.append(torch.tensor(list(found.uncertainty.standard_errors().values())))
-    z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)
-    # 48 standard normal numbers, four at a time correlated: their mean square is 1 within 0.4 or so. With 41 samples
-    # of two states and 4 lags the errors themselves are low by some 10 %.
-    assert 0.5 < (z**2).mean() < 2.2
 
 
 def test_scores_of_white_noise_sum_to_their_variance():
@@ -343,14 +266,6 @@ def test_intervals_from_logs_hold_the_truth(name, errors):
     for level, inside in ((0.95, found.inside), (0.68, found.inside_68)):
         shares = inside[~inside.isnan()]
         assert (shares - level).abs().max() < 3.0 * np.sqrt(level * (1.0 - level) / 100) + 0.01, (level, shares)
-
-
-@pytest.mark.nightly
-def test_bands_of_a_perceptron_hold_the_curve():
-    """Pointwise, where data was, over 100 draws of the noise and of the first weights."""
-    x = torch.linspace(-2.0, 2.0, 41).double()
-    inside = [covered(band(curve_estimate(seed).uncertainty, x, x[:, None]), x.sin()) for seed in range(100)]
-    assert np.mean(inside) >= 0.85
 
 
 @pytest.mark.nightly

@@ -70,16 +70,6 @@ def test_a_run_judges_on_the_true_system_and_keeps_its_hidden_states_hidden(tmp_
     export_c(loaded.policy("model_free"), tmp_path / "policy.c", loaded.physics, function="policy")
 
 
-def test_a_run_that_was_interrupted_goes_on_as_if_it_was_not(tmp_path):
-    whole = run_of(small_config(tmp_path / "whole", episodes=3, figures=False)).train()
-    run_of(small_config(tmp_path / "parts", episodes=1, figures=False)).train()
-    rest = run_of(small_config(tmp_path / "parts", episodes=3, figures=False, resume=True)).train()
-    for metrics in (whole, rest):
-        for episode in metrics["episodes"]:
-            del episode["seconds"]
-    assert whole["episodes"] == rest["episodes"]
-
-
 def test_the_optimum_is_that_of_the_true_system():
     unseen = UnseenEpisodes(real(), 4)
     start = LinearGain([[0.1, 0.1]])

@@ -115,17 +115,6 @@ def test_reference_speed_in_its_three_regions(u, expected):
         assert found == pytest.approx(expected, rel=1e-12)
 
 
-def test_reference_power_in_its_regions(c_p):
-    """Cubic through ½ρπR²C_p(λ*)u³ with ω_g = N_g λ* u/R up to 5 MW, then flat."""
-    plant = WindTurbine()
-    K = 0.5 * RHO * math.pi * R**5 * c_p(plant.best_tip_speed_ratio, 0.0) / (plant.best_tip_speed_ratio * N_G) ** 3
-    # K with R² u³ = R² (ω_g R/(N_g λ))³.
-    rated = (5e6 / K) ** (1 / 3)
-    for omega_g in (0.0, 50.0, 100.0, 0.999 * rated, 1.001 * rated, 200.0):
-        expected = min(5e6, K * omega_g**3)
-        assert plant.reference_power(torch.tensor(omega_g).double()).item() == pytest.approx(expected, rel=1e-9)
-
-
 def test_cost_counts_speed_and_power_errors():
     """e_1 = 0.1 and e_P = −0.2, put together by hand: ½(2·0.01 + 3·0.04)."""
     plant = WindTurbine(cost=PaperCost(speed=2.0, power=3.0))
