@@ -123,7 +123,7 @@ class OverBest(NamedTuple):
 def over_best(training: Training, unseen: int) -> OverBest:
     """How the law of a training's twin compares with the best ones of its form."""
     from rt_torchrl.runs.run_folder import CHECKPOINT  # here, because --help need not wait for TorchRL
-    from rt_torchrl.steps.flight import ShortTermMemory
+    from rt_torchrl.steps.interact import ShortTermMemory
 
     run, count = load_run(training.folder), EPISODES[training.plant]
     memory = ShortTermMemory(count)

@@ -40,11 +40,10 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
-from rt_torchrl.steps.flight import RealFlights, ShortTermMemory
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
-from rt_torchrl.steps.interact import Clearance, Interact, Operating
+from rt_torchrl.steps.interact import Clearance, Interact, Operating, RealFlights, ShortTermMemory
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, episode_report, findings, merged, on_device

@@ -21,8 +21,7 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.evaluation.unseen import RealEpisodes, UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimisers.descent import DescentConfig

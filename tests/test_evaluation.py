@@ -14,8 +14,7 @@ from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.checks import engine_gap
 from rt_torchrl.evaluation.limits import exact_optimum
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, UnseenEpisodes
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.trajectories.engines.interval import Autograd

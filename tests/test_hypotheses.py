@@ -14,9 +14,17 @@ from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, progress, twin_entries
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, counting, evidence, make_assimilation
+from rt_torchrl.steps.hypotheses.assimilation import (
+    EnsembleAssimilation,
+    Reread,
+    counting,
+    evidence,
+    make_assimilation,
+    misfit,
+    reread,
+    with_hidden_states,
+)
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.steps.hypotheses.fit import Reread, misfit, reread, with_hidden_states
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin

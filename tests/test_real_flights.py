@@ -14,8 +14,7 @@ from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import RealController, TwinEpisodes
+from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig

@@ -32,7 +32,7 @@ from rt_torchrl.fit.resampling import (
 )
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
-from rt_torchrl.steps.hypotheses.fit import reread
+from rt_torchrl.steps.hypotheses.assimilation import reread
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -19,8 +19,7 @@ from test_export_recipe import RECIPES
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.envs.pendulum.plant import UniformRod
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.evaluation.unseen import RealEpisodes, UnseenEpisodes
 from rt_torchrl.plants.closures import described_weights
 from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line

@@ -2,15 +2,15 @@
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.options import check_options
 
 Optimiser = Literal["adam", "lbfgs"]
@@ -60,6 +60,48 @@ class Descended(NamedTuple):
     best: float
     gradient: float
     iterations: int
+
+
+def norm_of(parts: list[Tensor]) -> Float[Tensor, ""]:
+    """The norm of a vector in parts."""
+    norms = torch._foreach_norm(parts)
+    return norms[0] if len(norms) == 1 else torch.linalg.vector_norm(torch.stack(norms))
+
+
+def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], limit: float) -> Float[Tensor, ""]:
+    r"""The mean of costs, with a limit for the gradient of each.
+
+    With :math:`g_i = \partial J_i/\partial w` the gradient is
+
+    .. math:: \frac1N\sum_i g_i\min\Bigl(1, \frac{\kappa\,|J_i|}{\|w\|\,\|g_i\|}\Bigr)
+
+    where κ is the limit: a gradient is too long if it says that the cost changes by itself when the weights change by
+    less than a share 1/κ of their norm. Where a closed loop is unstable for a while, small differences grow
+    exponentially, and so do gradients, although the cost hardly changes. Such an episode would decide on the direction
+    of a descent alone.
+
+    Args:
+        costs: costs J of the episodes, which depend on each weight.
+        weights: weights w by which the mean is differentiated.
+        limit: limit κ; infinite for the mean as it is.
+
+    Returns:
+        The mean, differentiable once by the weights and by nothing else if there is a limit.
+    """
+    if math.isinf(limit) or not costs.requires_grad:
+        return costs.mean()
+    weights = [w for w in weights if w.requires_grad]
+    each = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
+    slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
+    norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
+    allowed = limit * costs.detach().abs() / norm_of([weight.detach() for weight in weights])
+    # A cost of zero says nothing about what is long.
+    shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)
+    found = costs.detach().mean()
+    for weight, part in zip(weights, slopes, strict=True):
+        slope = torch.tensordot(shares, part, 1) / len(costs)
+        found = found + ((weight - weight.detach()) * slope).sum()
+    return found
 
 
 NOTHING = 1e-3

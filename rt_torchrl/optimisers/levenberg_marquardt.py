@@ -18,16 +18,25 @@ Denmark.
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.optimisers.placement import place
+
+
+def place(values: Float[Tensor, " n_w"], weights: Sequence[nn.Parameter]) -> None:
+    """Give weights these values; in place, because torch's ``vector_to_parameters`` would make them views of a vector.
+
+    Call it without gradients.
+    """
+    for weight, part in zip(weights, values.split([w.numel() for w in weights]), strict=True):
+        weight.copy_(part.view_as(weight))
 
 
 class NormalEquations(NamedTuple):

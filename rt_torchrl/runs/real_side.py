@@ -14,11 +14,11 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import (
     Baseline,
     Judged,
     RealController,
+    RealEpisodes,
     TwinEpisodes,
     UnseenEpisodes,
     mean_with_confidence,

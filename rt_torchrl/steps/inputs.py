@@ -20,8 +20,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.constraints import Constraints
-from rt_torchrl.steps.flight import record_of
-from rt_torchrl.steps.report import Step
+from rt_torchrl.steps.report import Step, record_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length

@@ -30,7 +30,7 @@ from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, Value
 from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, SoftUpdate, TD3Loss
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.optimisers.norm import norm_of
+from rt_torchrl.optimisers.descent import norm_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds

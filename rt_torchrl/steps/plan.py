@@ -11,8 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
-from rt_torchrl.optimisers.descent import Descended, Descent, stuck
-from rt_torchrl.optimisers.limited_mean import limited_mean
+from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, stuck
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints

@@ -12,6 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map_only
 
+from rt_torchrl.trajectories.trajectory import Trajectory
+
 Report = TypeVar("Report", bound=TensorDictBase)
 
 
@@ -149,3 +151,9 @@ def _settings(module: nn.Module) -> dict[str, Any]:
 def on_device(state: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """The state with all its tensors on a device."""
     return tree_map_only(Tensor, lambda tensor: tensor.to(device), state)
+
+
+def record_of(episode: TensorDictBase) -> Trajectory:
+    """The record of an episode as a trajectory."""
+    record = episode["record"]
+    return Trajectory(record["states"], record["actions"], record["exogenous"], float(record["start"]))

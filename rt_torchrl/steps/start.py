@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.config import Arm, Role
-from rt_torchrl.steps.flight import Flight
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.steps.interact import Flight
 from rt_torchrl.steps.report import same_architecture
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory

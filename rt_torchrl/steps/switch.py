@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, RefereeConfig, Role
-from rt_torchrl.steps.flight import record_of
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
 from rt_torchrl.steps.plan import Planner
-from rt_torchrl.steps.report import Step, findings, merged
+from rt_torchrl.steps.report import Step, findings, merged, record_of
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 Event = Literal["keep", "swap", "clone"]
