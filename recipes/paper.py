@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss
 
@@ -34,7 +35,7 @@ from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
 from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, LongTermMemory, ScaledPolicy
-from rt_torchrl.steps.report import weight_change, weight_vector
+from rt_torchrl.steps.report import weight_change
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 
@@ -74,7 +75,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
     inputs = plant.acting_inputs
 
     for i in range(options.episodes):
-        before = {role: weight_vector(policy) for role, policy in policies.items()}
+        before = {role: parameters_to_vector(policy.parameters()).detach() for role, policy in policies.items()}
 
         # Step 1, l. 7 to 13: a real episode; its record is D_S, because n_S = 1.
         acting.begin(policies[live], strength=table.exploration.strength(i))

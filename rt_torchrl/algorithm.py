@@ -105,10 +105,7 @@ class ReinforcementTwinning(TensorDictSequential):
     flights: RealFlights
     actor: LivePolicy
     collector: Operation | BaseCollector
-    clearance: Clearance
     assimilation: Assimilation
-    planning: MultiStart
-    imitation: Imitation
     short_term: ShortTermMemory
     operating: Operating | None
     steps: dict[str, Any]
@@ -184,10 +181,7 @@ class ReinforcementTwinning(TensorDictSequential):
             flights=flights,
             actor=actor,
             collector=collector,
-            clearance=clearance,
             assimilation=assimilation,
-            planning=planning,
-            imitation=imitation,
             short_term=interact.short_term,
             operating=interact.operating,
             steps=steps,
@@ -266,9 +260,9 @@ class ReinforcementTwinning(TensorDictSequential):
             self.steps["assimilate"].fit(records)
             self.assimilation.explain(self.belief.replayed(records), self.generator)
             if "model_based" in pupils:
-                self.planning.remember()
+                self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
-        found = self.imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
+        found = self.steps["switch"].imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
             self.virtual.processes.clear()

@@ -341,8 +341,15 @@ def test_target_follows_at_its_rate():
 def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, order):
     found, kinds, sizes = learner(algorithm, critic_iterations=7, actor_iterations=4, batch_size=64), [], []
     memory = filled(explored(20), found)
-    iteration, sample = found.iteration, memory.sample
-    monkeypatch.setattr(found, "iteration", lambda kind, keys: kinds.append(kind) or iteration(kind, keys))
+    call, sample = Iteration.__call__, memory.sample
+
+    def noted(iteration, batch):
+        kinds.append(
+            {(True, False): "critic", (False, True): "actor", (True, True): "both"}[iteration.critic, iteration.actor]
+        )
+        return call(iteration, batch)
+
+    monkeypatch.setattr(Iteration, "__call__", noted)
     monkeypatch.setattr(memory, "sample", lambda size: sizes.append(size) or sample(size))
     found.update()
     assert kinds == order

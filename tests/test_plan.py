@@ -253,7 +253,7 @@ def test_episodes_from_extreme_starts_have_the_inputs_of_others_and_count_where_
 @pytest.mark.parametrize(("dear", "imitates_there"), [(False, False), (True, True)])
 def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, imitates_there, monkeypatch):
     found, drawn = begun(), []
-    imitate, judge, teacher = found.imitation.imitate, found.virtual.judge, found.first.teacher
+    imitate, judge, teacher = found.steps["switch"].imitation.imitate, found.virtual.judge, found.first.teacher
 
     def seen(live, idle, *, seen, draw):
         drawn.append(len(draw().initial_state))
@@ -263,7 +263,7 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
         cost, price = judge(policy, episodes)
         return (cost if policy is teacher or not dear else 100.0 * cost), price
 
-    monkeypatch.setattr(found.imitation, "imitate", seen)
+    monkeypatch.setattr(found.steps["switch"].imitation, "imitate", seen)
     monkeypatch.setattr(found.virtual, "judge", judged)
     found.start()
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies

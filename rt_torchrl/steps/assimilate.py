@@ -127,11 +127,7 @@ class Assimilation:
             return self._descend_anew(whole)
         if self.config.segment is None:
             return self._over_chosen_segments(whole)
-        return self._over(whole, self.length)
-
-    def _over(self, whole: Trajectory, length: int) -> Descended:
-        """Descend over segments of a number of control intervals, or whole records with 0."""
-        self.length = min(length, whole.actions.shape[1])
+        self.length = min(self.length, whole.actions.shape[1])
         return self._descend_anew(self.in_segments(whole))
 
     def in_segments(self, whole: Trajectory) -> Trajectory:
@@ -145,7 +141,8 @@ class Assimilation:
 
         def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
             self._resume(copy.deepcopy(begun))
-            found = self._over(whole, length)
+            self.length = min(length, whole.actions.shape[1])
+            found = self._descend_anew(self.in_segments(whole))
             return (found, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
 
         found, self.length, progress = over_segments(

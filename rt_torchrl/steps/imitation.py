@@ -11,14 +11,12 @@ where its own errors lead (DAgger, Ross et al. 2011).
 
 import copy
 import functools
-import warnings
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
@@ -232,7 +230,7 @@ def match_actions(
     observations: Float[Tensor, "n n_o"],
     iterations: int,
 ) -> float:
-    """Fit the student's actions to a teacher's in place, by TorchRL's behaviour-cloning loss.
+    """Fit the student's actions to a teacher's in place: behaviour cloning by the mean square of their difference.
 
     Args:
         plant: plant that gives the ranges of the actions.
@@ -244,46 +242,15 @@ def match_actions(
     Returns:
         RMS difference between the actions as a share of their ranges.
     """
-    from torchrl.objectives import BCLoss  # here, because it takes seconds to load
+    low, high = bounds(plant.actions, device=observations.device)
 
-    imitator = ShareOfRange(plant, student, device=observations.device)
-    expert = TensorDict(
-        {"observation": observations, "action": imitator.share(wanted)}, batch_size=observations.shape[:1]
-    )
-    actor = TensorDictModule(imitator, in_keys=["observation"], out_keys=["action"])
-    with warnings.catch_warnings():
-        # BCLoss has no target network; TorchRL warns that its class does not declare one.
-        warnings.filterwarnings("ignore", message="The name target_actor_network_params", category=UserWarning)
-        loss = BCLoss(actor, loss_function="l2")
+    def share(action: Tensor) -> Tensor:
+        return (action - low) / (high - low)
+
+    target = share(wanted)
     descent = Descent(student, DescentConfig(optimiser="lbfgs", rate=1.0))
-    return descent.run(lambda: loss(expert)["loss_bc"], iterations).best ** 0.5
-
-
-class ShareOfRange(nn.Module):
-    """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
-
-    Args:
-        plant: plant that gives the ranges of the actions.
-        policy: policy whose actions are in physical units.
-        device: device of the observations; torch's default if None.
-    """
-
-    low: Tensor
-    range: Tensor
-
-    def __init__(self, plant: Plant, policy: nn.Module, *, device: torch.device | None = None):
-        super().__init__()
-        low, high = bounds(plant.actions, device=device)
-        self.policy = policy
-        self.register_buffer("low", low)
-        self.register_buffer("range", high - low)
-
-    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
-        return self.share(self.policy(observation))
-
-    def share(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
-        """Actions in physical units as shares of their ranges."""
-        return (action - self.low.to(action)) / self.range.to(action)
+    loss = functools.partial(nn.functional.mse_loss, target=target, reduction="none")
+    return descent.run(lambda: loss(share(student(observations))).mean(), iterations).best ** 0.5
 
 
 def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module], Result]) -> dict[Role, Result]:

@@ -15,7 +15,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.report import Step, as_findings, findings, merged, plain
+from rt_torchrl.steps.report import Step, findings, merged, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operator import FIRST, Operation, Order
@@ -415,7 +415,7 @@ class Operating:
         cost = torch.stack([flight.cost for flight in flights]).mean()
         report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
-        merged(report, as_findings(order.found or {})).update(findings(**(self.operation.acted or {})))
+        merged(report, findings(**(order.found or {}))).update(findings(**(self.operation.acted or {})))
         counted = [self.step.clearance.counted(flight.record) for flight in flights]
         kinds = counted[0].keys()
         report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
@@ -460,14 +460,9 @@ class Interact(Step):
         short_term = ShortTermMemory(config.records)
         super().__init__(env=env, clearance=clearance, short_term=short_term)
         self.short_term, self.policies, self.flights = short_term, policies, flights
-        self.clearance, self.belief = clearance, belief
+        self.clearance, self.belief, self.virtual = clearance, belief, belief.virtual
         self.config, self.judged = config, judged
         self.operating = Operating(env, self) if isinstance(env, Operation) else None
-
-    @property
-    def virtual(self) -> VirtualEpisodes:
-        """Virtual episodes of the twin."""
-        return self.belief.virtual
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         self.flights.begin()

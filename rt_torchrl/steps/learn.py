@@ -23,6 +23,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.nn.utils import parameters_to_vector
 from torch.optim.adam import adam
 from torch.utils._pytree import tree_flatten
 from torchrl.data import Bounded, LazyTensorStorage, MultiStep, TensorDictPrioritizedReplayBuffer, Writer
@@ -36,7 +37,7 @@ from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
-from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
+from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
 from rt_torchrl.systems.sound_part import finite_errors, finite_transitions
 
 
@@ -393,7 +394,11 @@ class ActorCritic:
                 errors = list[Tensor]()
                 for k, batch in enumerate(zip(*(drawn[key].split(self.batch_size) for key in keys), strict=True)):
                     safe_point()
-                    iteration = self.iteration("both" if delay and (first + k + 1) % delay == 0 else kind, keys)
+                    what = "both" if delay and (first + k + 1) % delay == 0 else kind
+                    name = (what, *keys)
+                    if name not in self._iterations:
+                        self._iterations[name] = Iteration(self, what, keys)
+                    iteration = self._iterations[name]
                     results = dict(zip(iteration.names, iteration(batch), strict=True))
                     errors += [results.pop("errors")] if "errors" in results else []
                     for name, value in results.items():
@@ -407,13 +412,6 @@ class ActorCritic:
                     self.memory.refresh(drawn["index"], sizes.flatten())
         scale = config.reward_scale
         return TensorDict({name: torch.stack(v).mean() / scale ** POWERS[name] for name, v in found.items()})
-
-    def iteration(self, kind: str, keys: Sequence[Key]) -> "Iteration":
-        """One iteration of the ``critic``, of the ``actor`` or of ``both``, traced when it is first asked for."""
-        name = (kind, *keys)
-        if name not in self._iterations:
-            self._iterations[name] = Iteration(self, kind, keys)
-        return self._iterations[name]
 
     def observations(self) -> Float[Tensor, "n n_o"]:
         """See :meth:`Learner.observations`."""
@@ -816,7 +814,7 @@ class Learn(Step):
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         policy = self.learner.policy
         self.store(episode["transitions"].values())
-        before, weights = copy.deepcopy(policy.state_dict()), weight_vector(policy)
+        before, weights = copy.deepcopy(policy.state_dict()), parameters_to_vector(policy.parameters()).detach()
         report = self.learner.update()
         if self.belief.corrects and self.belief.virtual.processes:
             report = merged(report, self._judged(before))

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, stuck
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints
-from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change, weight_vector
+from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
 from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -450,7 +451,7 @@ class MakePlan(Step):
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         policy, virtual = self.planning.planner.policy, self.planning.virtual
-        weights = weight_vector(policy)
+        weights = parameters_to_vector(policy.parameters()).detach()
         planned_on = virtual.draw(self.count, recorded=self.recorded)
         judged_on = virtual.draw(self.judged) if self.planning.judges else planned_on
         report = self.planning.plan(int(episode["number"]) + 1, planned_on, judged_on)

@@ -1,7 +1,6 @@
 """A step of the algorithm, the report of an episode, and the state and the architecture of parts."""
 
 import math
-from collections.abc import Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -10,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 from torch.utils._pytree import tree_map_only
 
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -69,11 +69,6 @@ def plain(report: TensorDict) -> dict[str, float | str]:
     return {key: value if isinstance(value, str) else float(value) for key, value in entries.items()}
 
 
-def as_findings(entries: Mapping[str, float | str]) -> TensorDict:
-    """The report of which :func:`plain` has made these entries."""
-    return findings(**entries)
-
-
 def merged(report: Report, other: TensorDictBase) -> Report:
     """The report with the entries of ``other`` added; the reasons of both stay."""
     reasons = [part["reason"] for part in (report, other) if "reason" in part]
@@ -117,14 +112,9 @@ def episode_report(episode: TensorDictBase) -> EpisodeReport:
     return EpisodeReport(episode.exclude("number", *data))
 
 
-def weight_vector(module: nn.Module) -> Tensor:
-    """All weights of a module in one vector, detached."""
-    return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
-
-
 def weight_change(module: nn.Module, earlier: Tensor) -> Tensor:
     """The relative change ‖w − w_earlier‖/‖w‖ of a module's weights since they were the vector ``earlier``."""
-    now = weight_vector(module)
+    now = parameters_to_vector(module.parameters()).detach()
     return (now - earlier).norm() / now.norm()
 
 
@@ -137,15 +127,13 @@ def same_architecture(first: nn.Module, second: nn.Module) -> bool:
 
 
 def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
-    """Class and settings of every submodule, and the shapes of what its state dict holds."""
-    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
+    """Class and settings of every submodule, such as an activation, and the shapes of what its state dict holds."""
+    parts = list[tuple[Any, ...]]()
+    for name, part in module.named_modules():
+        values = {key: value for key, value in vars(part).items() if not key.startswith("_") and key != "training"}
+        settings = {key: v.tolist() if isinstance(v, Tensor | np.ndarray) else v for key, v in values.items()}
+        parts.append((name, type(part), part.extra_repr(), settings))
     return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
-
-
-def _settings(module: nn.Module) -> dict[str, Any]:
-    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
-    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
-    return {name: v.tolist() if isinstance(v, Tensor | np.ndarray) else v for name, v in values.items()}
 
 
 def on_device(state: dict[str, Any], device: torch.device) -> dict[str, Any]:
