@@ -1,8 +1,9 @@
 """How Sphinx builds the documentation: Markdown by MyST, the reference of the public names by autodoc."""
 
-import logging
+import ast
 import re
 import typing
+from pathlib import Path
 
 from sphinx.ext.autodoc.preserve_defaults import DefaultValue
 from sphinx.util import inspect
@@ -47,6 +48,32 @@ html_theme_options = {
 }
 
 
+def reference(stub):
+    """The page of every public name, under the headings of the stub that lists the names."""
+    text, heading, page = stub.read_text(encoding="utf-8"), "", ["# Reference", ""]
+    headings = {number: line[2:] for number, line in enumerate(text.splitlines(), 1) if line.startswith("# ")}
+    for node in ast.parse(text).body:
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        above = headings[max(number for number in headings if number < node.lineno)]
+        if above != heading:
+            heading = above
+            page += [f"## {heading}", ""]
+        for name in (alias.name for alias in node.names):
+            value = getattr(rt_torchrl, name)
+            kind = "function" if inspect.isfunction(value) else "data"
+            if isinstance(value, type):
+                kind = "exception" if issubclass(value, BaseException) else "class"
+            hidden = ["   :no-value:"] if kind == "data" else []
+            page += ["```{eval-rst}", f".. auto{kind}:: rt_torchrl.{name}", *hidden, "```", ""]
+    return "\n".join(page)
+
+
+(Path(__file__).parent / "api.md").write_text(
+    reference(Path(rt_torchrl.__file__).with_suffix(".pyi")), encoding="utf-8"
+)
+
+
 def absolute_values(app, what, name, obj, options, lines):
     """|x| in a docstring is an absolute value, and not the substitution that reStructuredText takes it for."""
     for number, line in enumerate(lines):
@@ -78,6 +105,3 @@ def setup(app):
     """Sphinx calls this when it has read the settings above."""
     app.connect("autodoc-process-docstring", absolute_values)
     app.connect("autodoc-process-signature", readable_signatures)
-    # Patterns in the table of contents name pages that need not be there.
-    place = logging.getLogger("sphinx.sphinx.directives.other")
-    place.addFilter(lambda record: "glob pattern" not in str(record.msg))

@@ -29,8 +29,6 @@ from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyRep
 from .evaluation.unseen import RealController
 
 # Trajectories and the twin
-from .steps.config import LearnerConfig
-from .steps.learn import ActorCritic, Learner, LearningMethod
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
@@ -39,6 +37,8 @@ from .evaluation.clairvoyant import Clairvoyant, clairvoyant
 from .control.forecasts import Decaying, Forecast, Held, Foreseen, Scattered
 from .control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from .evaluation.limits import LimitConfig
+
+# Identification
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.log import LogConfig, read_log
 from .fit.sensors import SensorRecord, sensor_record
@@ -46,6 +46,8 @@ from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
+from .steps.config import LearnerConfig
+from .steps.learn import ActorCritic, Learner, LearningMethod
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
 from .steps.config import (
