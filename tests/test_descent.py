@@ -9,9 +9,8 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
 from rt_torchrl import DigitalTwin, PlannerConfig
-from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.optimisers.descent import Descent, DescentConfig, limited_mean
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
-from rt_torchrl.optimisers.limited_mean import limited_mean
 from rt_torchrl.steps.plan import WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario
 
