@@ -357,7 +357,6 @@ def test_what_cannot_be_recorded_is_refused(tmp_path):
         ({"plant": "windmill"}, "windmill"),
         ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5"),
         ({"plant": "wind_turbine", "states": ("rotor_speed", "foo")}, r"states=\['foo'\].*choose of rotor_speed"),
-        ({"plant": "wind_turbine", "law": "random"}, "law='random' does not exist; choose classical or policy"),
     ):
         with pytest.raises(ValueError, match=message):
             record.Config(log=tmp_path / "log.csv", **options)

@@ -31,7 +31,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 
 record_log = recipe("record_log")
-ClassicalLaw, recorded = record_log.ClassicalLaw, record_log.recorded
+recorded = record_log.recorded
 
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(
@@ -192,7 +192,7 @@ def test_what_does_not_exist_is_refused(tmp_path):
 
 def log_of(path, horizon, gap=False):
     plant = LinearQuadratic(horizon=horizon, noise=0.1)
-    log = recorded(plant, ClassicalLaw(PD(plant, GAINS)), torch.Generator().manual_seed(1))
+    log = recorded(plant, PD(plant, GAINS).act, torch.Generator().manual_seed(1))
     keep = abs(log.times - 0.5 * horizon) > 0.25 if gap else log.times >= 0.0
     log.chosen(keep).write(path)
     return log

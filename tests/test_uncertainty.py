@@ -98,15 +98,6 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         assert (width.high - width.low).isinf().tolist() == [False, True]
 
 
-def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():
-    predict = recipe("cascaded_tanks").predict
-    task = Estimation(DigitalTwin(Line(), Slope()), position())
-    sensors, values = position(), 0.5 * TIMES + NOISE * noise_of(81, 0)
-    estimate = task.run([sensor_record(Line(), sensors, line_segment(values))])
-    calm, wind = (predict(task, estimate, sensor_record(Line(), sensors, line_segment(values, wind=z))) for z in (0, 1))
-    assert calm.deviation.isfinite().all() and wind.deviation[1:].isinf().all()
-
-
 def test_the_band_of_a_line_is_that_of_regression():
     found = line_estimate()
     x = torch.linspace(-3.0, 3.0, 7).double()
@@ -165,58 +156,18 @@ def test_named_errors_follow_from_those_of_the_logarithms():
     assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]
 
 
-made = recipe("cascaded_tanks")
-Prediction, predict, residual_tests = made.Prediction, made.predict, made.residual_tests
-
-
-def predicted(first=20):
-    """Another record of the line, from a start that its first samples tell."""
-    found = line_estimate()
-    closure = Slope()
+def test_a_simulation_starts_where_its_first_samples_say():
+    found, closure = line_estimate(), Slope()
     with torch.no_grad():
         closure.w.copy_(found.likelihood.twin.closure.w)
     values = 3.0 + (0.5 + 0.3 * 1.5) * TIMES + NOISE * noise_of(81, 7)
     record = sensor_record(Line(), position(), line_segment(values, wind=1.5))
     task = Estimation(DigitalTwin(Line(), closure), position())
-    return found, values, predict(task, found, record, first=first), record
-
-
-def test_a_simulation_starts_where_its_first_samples_say():
-    found, values, made, _ = predicted()
+    readings = recipe("cascaded_tanks").simulated(task, found, record, first=20)
     w = found.likelihood.twin.closure.w.detach().numpy()
     slope = w[0] + 1.5 * w[1]
     start = np.mean(values[:20] - slope * TIMES[:20])
-    np.testing.assert_allclose(made.readings[:, 0].numpy(), start + slope * TIMES, atol=1e-6)
-    assert made.rms[0].item() == pytest.approx(np.sqrt(np.mean((values - start - slope * TIMES) ** 2)), abs=1e-6)
-    variance = np.array([1.0, 1.5]) @ exact_covariance() @ np.array([1.0, 1.5]) * TIMES**2 + NOISE**2 / 20
-    np.testing.assert_allclose(made.deviation[:, 0].numpy(), np.sqrt(variance), rtol=1e-4)
-
-
-def test_the_interval_of_an_rms_error_holds_it():
-    made = predicted()[2]
-    low, high = made.rms_interval(5)
-    assert low < made.rms[0].item() < high < 2.0 * low
-    with pytest.raises(ValueError, match="block=81"):
-        made.rms_interval(81)
-
-
-def test_residuals_that_follow_the_action_are_found():
-    """Errors that are the action three samples before, and white noise of the same size."""
-    record = predicted()[3]
-    n = 400
-    action = torch.from_numpy(noise_of(n, 1))[:, None]
-    late = torch.cat([torch.zeros(3, 1).double(), action[:-3], action[-1:]])
-    white = torch.from_numpy(noise_of(n + 1, 2))[:, None]
-    record = record._replace(actions=action, exogenous=action)
-    tests = [
-        residual_tests(Prediction(0.0 * e, e, e, e[0], e[0]), record, lags=20) for e in (late + 0.5 * white, white)
-    ]
-    assert tests[0].cross.abs().argmax() == 3 and tests[0].cross[3] > 0.8
-    # One in twenty is outside its bound by chance.
-    assert (tests[1].cross.abs() > tests[1].bound).sum() <= 4 and (tests[1].auto.abs() > tests[1].bound).sum() <= 4
-    assert "outside ±0.098" in tests[0].describe()
-    with pytest.raises(ValueError, match="lags=400"):
-        residual_tests(Prediction(white, white, white, white[0], white[0]), record, lags=400)
+    np.testing.assert_allclose(readings[:, 0].numpy(), start + slope * TIMES, atol=1e-6)
 
 
 class WindyLine(Line):

@@ -3,7 +3,6 @@
 import math
 import os
 import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,25 +61,22 @@ class WindRecord:
             return f"time has shape {time.shape} and speed {speed.shape}; pass two vectors of equal length."
         if len(time) < 2:
             return f"holds {len(time)} wind samples; at least 2 are needed: is the file written to its end?"
-        if (bad := ~((speed >= 0.0) & (speed <= GREATEST_SPEED))).any():
-            at = np.argmax(bad)
-            return (
-                f"wind speed at t = {time[at]:g} s is {speed[at]:g} m/s; it must be from 0 to {GREATEST_SPEED:g} m/s. "
-                "Check its unit, its sign and the direction, 0 deg along the rotor axis, or fill the gap."
-            )
         steps = np.diff(time)
-        if (bad := ~((steps > 0.0) & (steps < np.inf))).any():
-            before, after = time[np.argmax(bad) :][:2]
-            return f"time goes from {before:g} s to {after:g} s; it must increase. Sort the samples, drop doubles."
         # Two times rounded to 1 ms give a step that is off by up to 1 ms; below 2 ms this would hide a missing sample.
         step = float(np.median(steps))
-        bad = np.abs(steps - step) > min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
-        if bad.any():
-            where, odd = time[np.argmax(bad)], steps[np.argmax(bad)]
-            return (
-                f"the step after t = {where:g} s is {odd:g} s instead of {step:g} s. Fill the gap by interpolation, "
-                "cut the record there, or resample it to equal steps."
-            )
+        uneven = ~(np.abs(steps - step) <= min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step))
+        faults = {
+            "wind speed at t = {0:g} s is {2:g} m/s; it must be from 0 to 200 m/s. Check its unit, its sign and the "
+            "direction, 0 deg along the rotor axis, or fill the gap.": ~((speed >= 0.0) & (speed <= GREATEST_SPEED)),
+            "time goes from {0:g} s to {1:g} s; it must increase. Sort the samples, drop doubles.": ~(steps > 0.0),
+            "the step after t = {0:g} s is {3:g} s instead of {4:g} s. Fill the gap by interpolation, cut the record "
+            "there, or resample it to equal steps.": uneven,
+        }
+        for text, wrong in faults.items():
+            if wrong.any():
+                k = int(np.argmax(wrong))
+                after = min(k + 1, len(steps))
+                return text.format(time[k], time[after], speed[k], time[after] - time[k], step)
         return ""
 
 
@@ -127,32 +123,30 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
     with open(path, encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
             # Fortran's list-directed input separates by blanks or commas.
-            fields = re.split("[!#%]", line)[0].replace(",", " ").split()
-            if fields:
-                rows.append(_numbers(fields, f"{path}, line {number}"))
+            fields, where = re.split("[!#%]", line)[0].replace(",", " ").split(), f"{path}, line {number}"
+            if not fields:
+                continue
+            if len(fields) < 8:
+                raise ValueError(f"{where}: {len(fields)} columns, but 8 are needed: {COLUMNS}. Complete the line.")
+            try:
+                rows.append([float(field) for field in fields[:8]])
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}; begin the line with '!' if it is a comment.") from None
+            if not np.isfinite(rows[-1]).all():
+                raise ValueError(f"{where}: value 'NaN' or 'inf' in {line.strip()!r} is not finite. Fill the gap.")
     columns = np.array(rows, dtype=np.float64).reshape(-1, 8)
     speed = (columns[:, 1] + columns[:, 7]) * np.cos(np.deg2rad(columns[:, 2]))
     return WindRecord(columns[:, 0], speed, str(path))
 
 
-def _numbers(fields: list[str], where: str) -> list[float]:
-    if len(fields) < 8:
-        raise ValueError(f"{where}: {len(fields)} columns, but 8 are needed: {COLUMNS}. Complete the line.")
-    try:
-        values = [float(field) for field in fields[:8]]
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}; begin the line with '!' if it is a comment.") from None
-    if not np.isfinite(values).all():
-        raise ValueError(f"{where}: value {fields[int(np.argmin(np.isfinite(values)))]!r} is not finite. Fill the gap.")
-    return values
-
-
-HEADER = (
-    *("identifier", "n_z", "n_y", "n_tower", "n_t", "dz", "dy", "dt", "mean_speed", "hub_height", "bottom"),
-    *("u_slope", "u_offset", "v_slope", "v_offset", "w_slope", "w_offset", "n_description"),
+COUNTS, SCALES = ("n_z", "n_y", "n_tower", "n_t"), ("dz", "dy", "dt", "mean_speed", "hub_height", "bottom")
+UNITS = ("u_slope", "u_offset", "v_slope", "v_offset", "w_slope", "w_offset")
+HEADER = np.dtype(
+    [("identifier", "<i2"), *((name, "<i4") for name in COUNTS), *((name, "<f4") for name in (*SCALES, *UNITS))]
+    + [("n_description", "<i4")]
 )
 """The fixed part of a ``.bts`` file, in the order in which it is written."""
-LAYOUT = struct.Struct("<h4i12fi")
+AGAIN = "Copy the file again, in binary mode, or run TurbSim again."
 
 
 def read_bts(path: str | os.PathLike[str]) -> WindRecord:
@@ -169,16 +163,32 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
 
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198, appendix on binary full-field files.
     """
-    header = _read_header(path)
-    start = LAYOUT.size + header.n_description
-    shape = (header.n_t, header.n_z * header.n_y + header.n_tower, 3)
-    expected, size = start + 2 * math.prod(shape), os.path.getsize(path)
-    if size != expected:
-        state = "is truncated" if size < expected else "is too long"
+    size = os.path.getsize(path)
+    if size < HEADER.itemsize:
         raise ValueError(
-            f"{path}: {state}, it holds {size} bytes, but its header ({header.n_t} steps of "
-            f"{header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies {expected} bytes. "
-            "Copy the file again, in binary mode, or run TurbSim again."
+            f"{path}: is truncated, it holds {size} bytes, but the header alone takes {HEADER.itemsize} bytes. {AGAIN}"
+        )
+    read = np.fromfile(path, HEADER, 1)[0]
+    header = SimpleNamespace(**{name: read[name].item() for name in read.dtype.names})
+    if header.identifier not in (7, 8):
+        raise ValueError(
+            f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "
+            "(periodic). Is it another format, such as Bladed's .wnd? Run TurbSim with WrADFF."
+        )
+    counts_right = min(header.n_z, header.n_y, header.n_t) >= 1 and min(header.n_tower, header.n_description) >= 0
+    scales = (header.dz, header.dy, header.dt, header.u_slope)
+    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in vars(header).values())):
+        raise ValueError(
+            f"{path}: header is corrupt, {header}; counts and spacings must be positive and all values finite. {AGAIN}"
+        )
+    start = HEADER.itemsize + header.n_description
+    shape = (header.n_t, header.n_z * header.n_y + header.n_tower, 3)
+    expected = start + 2 * math.prod(shape)
+    if size != expected:
+        raise ValueError(
+            f"{path}: is {'truncated' if size < expected else 'too long'}, it holds {size} bytes, but its header "
+            f"({header.n_t} steps of {header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies "
+            f"{expected} bytes. {AGAIN}"
         )
     # The field is mapped and not read, because it has hundreds of megabytes, of which the hub needs four columns. The
     # reader of openfast_toolbox and weio allocates what the header declares, in double precision, and checks no length.
@@ -189,30 +199,6 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     # The interval is stored in single precision; its shortest decimal is the number that TurbSim was given.
     time = float(str(np.float32(header.dt))) * np.arange(header.n_t)
     return WindRecord(time, (np.sum(corners, axis=0) - header.u_offset) / header.u_slope, str(path))
-
-
-def _read_header(path: str | os.PathLike[str]) -> SimpleNamespace:
-    with open(path, "rb") as file:
-        head = file.read(LAYOUT.size)
-    if len(head) < LAYOUT.size:
-        raise ValueError(
-            f"{path}: is truncated, it holds {len(head)} bytes, but the header alone takes {LAYOUT.size} bytes. "
-            "Copy the file again or run TurbSim again."
-        )
-    header = SimpleNamespace(**dict(zip(HEADER, LAYOUT.unpack(head), strict=True)))
-    if header.identifier not in (7, 8):
-        raise ValueError(
-            f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "
-            "(periodic). Is it another format, such as Bladed's .wnd? Run TurbSim with WrADFF."
-        )
-    counts_right = min(header.n_z, header.n_y, header.n_t) >= 1 and min(header.n_tower, header.n_description) >= 0
-    scales = (header.dz, header.dy, header.dt, header.u_slope)
-    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in vars(header).values())):
-        raise ValueError(
-            f"{path}: header is corrupt, {header}; counts and spacings must be positive and all values finite. "
-            "Copy the file again, in binary mode, or run TurbSim again."
-        )
-    return header
 
 
 def _interpolation(path: str | os.PathLike[str], position: float, n: int, side: str) -> list[tuple[int, float]]:
