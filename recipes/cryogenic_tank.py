@@ -112,7 +112,6 @@ class Config(RunConfig):
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         fluid: name in CoolProp of the pure fluid in the tank.
-        wall: scheme for the wall temperature: explicit, or exponential for a light wall.
         wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
             twinning.assimilation.initial is estimated.
@@ -132,7 +131,6 @@ class Config(RunConfig):
     dt: float = 30.0
     horizon: float = 4.32e5
     fluid: str = "Hydrogen"
-    wall: Literal["explicit", "exponential"] = "explicit"
     wall_heat_capacity: float = 500e3
     model_error: bool = False
     unknown: tuple[str, ...] = ()
@@ -180,7 +178,6 @@ class Config(RunConfig):
             dt=self.dt,
             horizon=self.horizon,
             fluid=self.fluid,
-            wall=self.wall,
             wall_heat_capacity=self.wall_heat_capacity,
             cost=self.cost(),
             command=self.command,
@@ -219,9 +216,9 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 
 
 def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.cryogenic_tank.figures import save_animation
+    from rt_torchrl.envs.cryogenic_tank.figures import scene
 
-    save_animation(snapshot, path)
+    scene(snapshot).save(path)
 
 
 def main(config: Config, **parts: Any) -> None:

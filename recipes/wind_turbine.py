@@ -201,9 +201,9 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 
 
 def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.wind_turbine.figures import save_animation
+    from rt_torchrl.envs.wind_turbine.figures import scene
 
-    save_animation(snapshot, path)
+    scene(snapshot).save(path)
 
 
 def main(config: Config, **parts: Any) -> None:

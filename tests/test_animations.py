@@ -30,7 +30,7 @@ def boiling():
 
 @pytest.mark.parametrize(("scene", "snapshot"), [(turbine, "blowing"), (tank, "boiling")])
 def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
-    path = scene.save_animation(request.getfixturevalue(snapshot), tmp_path / "last.gif")
+    path = scene.scene(request.getfixturevalue(snapshot)).save(tmp_path / "last.gif")
     with Image.open(path) as animation:
         assert animation.n_frames == 20 and animation.info["duration"] == 1000 / RATE
         first = np.asarray(animation.convert("RGB"))
@@ -78,4 +78,4 @@ def test_a_trace_keeps_its_axes_and_another_format_is_refused(blowing, tmp_path)
     show(0)
     assert ax.get_ylim() == limits and line.get_ydata().tolist() == [0.0]
     with pytest.raises(ValueError, match=r"must end in '\.gif'"):
-        turbine.save_animation(blowing, tmp_path / "last.mp4")
+        turbine.scene(blowing).save(tmp_path / "last.mp4")

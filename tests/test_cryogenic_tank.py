@@ -240,15 +240,14 @@ def test_any_positive_closure_of_the_features_can_stand_in():
             return self.size * torch.exp(0.1 * self.network(features))
 
     closure = Perceptron()
-    for wall in ("explicit", "exponential"):
-        plant = CryogenicTank(closure=closure, wall=wall)
-        state = plant.state_at(torch.full((3, 7), 500e3).double())
-        load, drop = torch.full((3, 1, 1), 129.0).double(), torch.full((3, 7, 1), 5e4).double()
-        end = plant.step(torch.zeros(3, 1).double(), state, drop, load, closure).state
-        assert end.shape == (3, 7, 3)
-        assert torch.equal(end[:, 0], end[:, 6])
-        gradients = torch.autograd.grad(end.sum(), list(closure.parameters()))
-        assert all(gradient.isfinite().all() and gradient.abs().max() > 0 for gradient in gradients)
+    plant = CryogenicTank(closure=closure)
+    state = plant.state_at(torch.full((3, 7), 500e3).double())
+    load, drop = torch.full((3, 1, 1), 129.0).double(), torch.full((3, 7, 1), 5e4).double()
+    end = plant.step(torch.zeros(3, 1).double(), state, drop, load, closure).state
+    assert end.shape == (3, 7, 3)
+    assert torch.equal(end[:, 0], end[:, 6])
+    gradients = torch.autograd.grad(end.sum(), list(closure.parameters()))
+    assert all(gradient.isfinite().all() and gradient.abs().max() > 0 for gradient in gradients)
 
 
 def test_policy_is_the_papers(plant):
@@ -351,43 +350,3 @@ def test_sensitivity_to_the_coefficients():
     torch.testing.assert_close(rms, torch.cat([double(wall), cooling]), rtol=0.1, atol=0)
     assert rms[0].item() == pytest.approx(4.0, abs=0.5)
     assert 4 * rms[0] < rms[1] < rms[2]  # U_s is the hardest to see, K_JT the easiest
-
-
-# The wall
-
-
-@torch.no_grad()
-def test_exponential_wall_conserves_energy():
-    plant = CryogenicTank(wall="exponential", wall_heat_capacity=LIGHT_WALL)
-    load = plant.draw_exogenous(1, seeded(4))[:, :200]
-    states = flown(plant, (500e3,), (0.0,), load, 200)
-    energy = Ledger(plant).energy(states, LIGHT_WALL)
-    gained = (plant.dt * load[..., 0]).cumsum(-1)
-    torch.testing.assert_close(energy[:, 1:] - energy[:, :1], gained, rtol=0, atol=1e-8 * gained[0, -1].item())
-
-
-@pytest.mark.parametrize("heat_capacity, fine", [(M_C, 30.0), (LIGHT_WALL, 5.0)])
-def test_exponential_wall_agrees_with_a_resolved_one(heat_capacity, fine):
-    n, inner = 60, round(30.0 / fine)
-    exact = CryogenicTank(dt=fine, horizon=fine, wall_heat_capacity=heat_capacity)
-    plant = CryogenicTank(wall="exponential", wall_heat_capacity=heat_capacity)
-    load = plant.draw_exogenous(1, seeded(4))[:, :n]
-    coarse = flown(plant, (500e3,), (100e3,), load, n)
-    resolved = flown(exact, (500e3,), (100e3,), load.repeat_interleave(inner, 1), n * inner)[:, ::inner]
-    gap = (coarse - resolved).abs()[0].amax(0)
-    # T_s lags by what T moves in an interval, 1e-4 K; while the wall warms up, the heat of a part of an interval.
-    assert gap[0] < 2e-4 and gap[2] < 5.0
-    assert resolved[0, :, 2].max() - resolved[0, :, 2].min() > 300.0
-
-
-def test_exponential_wall_survives_any_closure():
-    plant = CryogenicTank(wall="exponential", wall_heat_capacity=1.0)
-    closure = ConstantCoefficients(double(1e5, 75.0, K_JT))
-    rollout = Rollout(plant, closure)
-    states = rollout(
-        plant.draw_initial_state(2, seeded()),
-        plant.draw_exogenous(2, seeded())[:, :50],
-        torch.full((2, 50, 1), 1e5, dtype=torch.float64),
-    ).states
-    T = plant.saturation(states[..., 2]).T
-    assert (states[:, 1:, 0] - T[:, 1:]).abs().max() < 1e-3

@@ -12,7 +12,7 @@ from torch import nn
 
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.figures import save_animation
+from rt_torchrl.envs.flapping_wing.figures import scene
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.animation import FRAMES, RATE
 from rt_torchrl.figures.snapshot import Snapshot
@@ -163,7 +163,7 @@ def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapsho
 
 @pytest.mark.slow
 def test_animation_has_all_frames(snapshot, tmp_path):
-    path = save_animation(snapshot, tmp_path / "flight.gif")
+    path = scene(snapshot).save(tmp_path / "flight.gif")
     with Image.open(path) as animation:
         assert animation.n_frames == FRAMES
         assert animation.info["duration"] == 1000 / RATE
@@ -175,5 +175,5 @@ def test_animation_has_all_frames(snapshot, tmp_path):
 
 def test_animation_of_another_format_is_refused(snapshot, tmp_path):
     with pytest.raises(ValueError, match=r"flight\.mp4.*must end in '\.gif'"):
-        save_animation(snapshot, tmp_path / "flight.mp4")
+        scene(snapshot).save(tmp_path / "flight.mp4")
     assert list(tmp_path.iterdir()) == []

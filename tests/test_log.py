@@ -9,7 +9,6 @@ import torch
 from linear_quadratic import LinearQuadratic
 from test_export_recipe import recipe
 
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.log import Column, SensorLog, checked, converted, read_log
@@ -243,19 +242,6 @@ def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
     assert np.abs(noisy.columns["angle"]).max() <= math.pi and checked(noisy, plant) is noisy
     with pytest.raises(ValueError, match="jitter=0.4: plant 'pendulum' steps by a scheme of its own.*jitter=0"):
         recorded(plant, policy_law(plant, policy), torch.Generator(), jitter=0.4)
-
-
-def test_the_recorder_steps_as_a_tank_with_a_light_wall_does():
-    """Its wall is far too fast for the Runge-Kutta step of the vector field, by which other plants are recorded."""
-    plant = CryogenicTank(horizon=3000.0, wall="exponential", wall_heat_capacity=500.0)
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    log = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(1))
-    generator = torch.Generator().manual_seed(1)
-    start, load = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, policy)(start, load)
-    for k, state in enumerate(plant.states):
-        np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=1e-9)
 
 
 def test_jitter_and_noise_are_as_large_as_asked():

@@ -264,7 +264,7 @@ WRONG = {
     "ms for s": (lambda: FlappingWing(dt=0.5, horizon=5.0), "dt=0.5 s does not resolve", "dt <= 0.0025 s"),
     "s for ms": (lambda: GaussianGust(time_scale=1e4), "time_scale=10000 s of GaussianGust", "1 ms is 0.001 s"),
     "gusts in km/h": (lambda: GaussianGust(mean=36.0), "mean=36 m/s of GaussianGust", "1 km/h is 0.278 m/s"),
-    "kJ for J": (lambda: CryogenicTank(wall_heat_capacity=500.0), "heat capacity 500 J/K", "wall='exponential'"),
+    "kJ for J": (lambda: CryogenicTank(wall_heat_capacity=500.0), "heat capacity 500 J/K", "a heavier wall"),
     "h for s": (lambda: CyclicLoad(period=1.5), "period=1.5 s of CyclicLoad", "1 h is 3600 s"),
     "mW for W": (lambda: CyclicLoad(peak=250e3), "peak=250000 W of CyclicLoad", "1 mW is 0.001 W"),
     "deg for rad": (

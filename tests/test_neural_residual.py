@@ -110,14 +110,15 @@ def test_it_begins_as_the_plant_itself(base):
 
 
 def test_a_plant_that_wraps_a_runge_kutta_step_takes_one_of_the_sum():
-    base = CryogenicTank()  # overrides advance for its exponential wall, and has the explicit one
-    ranges = {"wall_temperature": (20.0, 25.0)}
-    plant = NeuralResidual(base, {"wall_temperature": 0.1}, inputs=("wall_temperature",), ranges=ranges)
+    class Wrapping(LinearQuadratic):
+        def advance(self, *given):
+            return super().advance(*given)
+
+    plant = pushed(Wrapping())
     closure = stirred(plant.make_closure(torch.Generator()))
-    generator = torch.Generator().manual_seed(1)
-    state, exogenous = plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)[:, 0]
-    arguments = torch.zeros(1).double(), state, 0.0 * exogenous + 1e4, exogenous, closure
+    (state, exogenous, command), t = flight(plant), torch.zeros(1).double()
     assert not plant.own_scheme
+    arguments = t, state, command[:, 0], exogenous[:, 0], closure
     torch.testing.assert_close(plant.advance(*arguments), Plant.advance(plant, *arguments), rtol=1e-14, atol=0.0)
 
 

@@ -99,8 +99,7 @@ def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     value = torch.from_numpy(P * plant.dt)
     config = PredictiveConfig(horizon=0.3, tolerance=0.0, iterations=200)
-    tail = lambda t, end, exogenous: ((end @ value) * end).sum(-1)  # noqa: E731
-    controller = RecedingHorizon(plant, plant.closure, config, tail=tail)
+    controller = RecedingHorizon(plant, plant.closure, config, terminal=lambda end: ((end @ value) * end).sum(-1))
     state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
     flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
     s = state.numpy().T

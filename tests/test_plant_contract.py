@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl import DelayedActuator, ScaledActuator, Transition, check_plant, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.unknown_systems import SYSTEMS
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.systems.environment import PlantEnv
@@ -59,16 +60,12 @@ def test_a_scheme_of_its_own_is_found_by_what_a_step_does():
 
     found = {kind: kind().own_scheme for kind in (LinearQuadratic, Own, Back, Wrapping, Stepping)}
     assert found == {LinearQuadratic: False, Own: True, Back: False, Wrapping: False, Stepping: True}
-    assert {wall: CryogenicTank(wall=wall).own_scheme for wall in ("explicit", "exponential")} == {
-        "explicit": False,
-        "exponential": True,
-    }
 
 
 def test_an_extension_has_the_scheme_of_its_plant_unless_hidden_states_have_their_own_solution():
     found = [
         ScaledActuator(CryogenicTank(), "valve_drop", 0.9),
-        ScaledActuator(CryogenicTank(wall="exponential"), "valve_drop", 0.9),
+        ScaledActuator(Pendulum(), "torque", 0.9),
         DelayedActuator(LinearQuadratic(), "force", 0.3),
         ScaledActuator(DelayedActuator(LinearQuadratic(), "force", 0.3), "force", 0.9),
     ]
@@ -198,7 +195,7 @@ RECIPES = {
     "flapping_wing": (("mlp", "paper"), ("--task hop", "--energy 0.1 --tilt 0.1", "--observe phase")),
     "cryogenic_tank": (
         ("mlp", "paper"),
-        ("--command drop --end-weight 0", "--observe phase", "--wall exponential"),
+        ("--command drop --end-weight 0", "--observe phase"),
     ),
 }
 """Policies of each plant, and options that change what it computes."""

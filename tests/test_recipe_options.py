@@ -53,7 +53,6 @@ def made(plant, **options):
         ("flapping_wing", {"mean_wind": 1e42}, r"mean_wind=1e\+42 m/s must lie within ±120"),
         ("flapping_wing", {"wind_deviation": -1.0}, r"wind_deviation=-1.0 m/s must lie in \[0, 120\]"),
         ("flapping_wing", {"peak": "sharp"}, "peak='sharp' does not exist; choose unit or printed"),
-        ("cryogenic_tank", {"wall": "thin"}, "wall='thin' does not exist; choose explicit or exponential"),
         ("pendulum", {"guess": 1e308}, r"guess=1e\+308 of the pendulum must be positive and at most 1000"),
         ("pendulum", {"judged_on": "paper"}, "judged_on='paper' does not exist; choose real or plant"),
         ("pendulum", {"horizon": 1e308}, r"horizon=1e\+308 s of plant 'pendulum' is inf steps dt=0.05 s"),

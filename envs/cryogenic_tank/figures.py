@@ -1,6 +1,5 @@
 """Figures of the cryogenic tank: its days in orbit, vent, coefficients, path of the vented fluid, and an animation."""
 
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -224,35 +223,18 @@ def vent_path(snapshot: Snapshot) -> Figure:
     return figure
 
 
-def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
-    """Write the last real episode as a GIF of five seconds.
+@torch.no_grad()
+def scene(snapshot: Snapshot) -> Scene:
+    """The last real episode as an animation.
 
     The tank shows the share of its volume that is liquid, the heat load as an arrow through the wall, and the vent flow
     as puffs behind the valve, as many as its share of the greatest flow of the episode. Beside it stand pressure with
     its set point, vent flow and load up to the present.
-
-    Args:
-        snapshot: snapshot with the episode.
-        path: path of the file, which ends in ``.gif``.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        ValueError: if the file has another suffix.
     """
-    return scene(snapshot).save(len(snapshot.record.actions), path)
-
-
-@torch.no_grad()
-def scene(snapshot: Snapshot) -> Scene:
-    """The picture at the start of any interval of the record."""
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     state = record.states[:-1]
     pressure, fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
     flow, load = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow), array(record.exogenous[:, 0])
-    time, label = style.time_axis(plant, len(state))
-    unit = label.removeprefix("time [").removesuffix("]")
 
     def draw(ax: Axes) -> tuple[list[Artist], Show]:
         ax.set(xlim=(-1.9, 1.9), ylim=(-1.3, 2.3), aspect="equal")
@@ -267,7 +249,7 @@ def scene(snapshot: Snapshot) -> Scene:
         arrow = ax.quiver([-1.75], [0.0], [0.0], [0.0], color=TWIN, width=0.02, **units)
         note = ax.text(-1.85, -1.25, "", fontsize=9)
 
-        def show(k: int) -> tuple[str, str]:
+        def show(k: int) -> str:
             # From one edge of the surface along the wall to the other.
             half = np.arccos(-level(fill[k]))
             angle = np.linspace(-half, half, 91)
@@ -278,7 +260,7 @@ def scene(snapshot: Snapshot) -> Scene:
             valve.set_color(SAMPLES if count else REAL)
             arrow.set_UVC([0.7 * load[k] / load.max()], [0.0])
             note.set_text(f"load {load[k]:.0f} W, {100.0 * fill[k]:.1f} % liquid")
-            return f"time {time[k]:.1f} {unit}", f"{pressure[k]:.0f} kPa"
+            return f"{pressure[k]:.0f} kPa"
 
         return [liquid, shell, valve, puffs, arrow, note], show
 

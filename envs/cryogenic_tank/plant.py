@@ -3,7 +3,7 @@ r"""The cryogenic tank as a plant: a wall, a saturated mixture and a thermodynam
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients, CubicV
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
-from rt_torchrl.plants.sampling import DisturbanceModel, require_stable_step, rk4_step
+from rt_torchrl.plants.sampling import DisturbanceModel, require_stable_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Phase, Signal
 
@@ -46,7 +46,6 @@ COMMANDS = {
 COSINE, SINE = Phase("cosine", CyclicLoad.period), Phase("sine", CyclicLoad.period)
 """Phase of the orbit; its cosine is −1 at the peak of the load."""
 MEASURED = ("pressure_error", "superheat", "liquid_volume")
-Wall = Literal["explicit", "exponential"]
 
 
 @runtime_checkable
@@ -156,10 +155,10 @@ class CryogenicTank(Plant):
     A pressure outside the range makes the rates NaN, which the library reports as a ``DivergenceError``.
 
     Note: the paper prints no mass of the wall; here m_s c_s is 500 kJ/K, because a bare shell of aluminium at 27 K
-    (20 kJ/K) follows the load within 5 s: too fast for an explicit step of 30 s, but not for ``wall="exponential"``.
+    (20 kJ/K) follows the load within 5 s, too fast for an explicit step of 30 s.
     Note: the paper prints U_s per area but no area; here A_s is 74.1 m², that of a sphere of 60 m³.
 
-    With the explicit wall U_s must stay below 2.785 m_s c_s/(A_s dt) = 626 W/(m² K), see :meth:`wall_rate`. The plant
+    U_s must stay below 2.785 m_s c_s/(A_s dt) = 626 W/(m² K), see :meth:`wall_rate`. The plant
     checks the true closure; the twin starts far below the limit and diverges with an error if training exceeds it.
 
     Args:
@@ -168,7 +167,6 @@ class CryogenicTank(Plant):
         closure: closure of the real tank, from :meth:`features` to U_s, U_HX, K_JT; None for the paper's constants.
         load: source of the heat load.
         fluid: pure fluid in the tank, by its name in CoolProp; ``ParaHydrogen`` is what hydrogen becomes when stored.
-        wall: ``explicit`` integrates the wall with the rest, ``exponential`` by its own solution, see :meth:`advance`.
         wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         cost: running and terminal cost of J_a; None for the paper's.
         command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
@@ -176,7 +174,7 @@ class CryogenicTank(Plant):
         observe: names of ``measurements`` and ``observation_sets``; by default the paper's error.
 
     Raises:
-        ValueError: for an unknown fluid or wall, a size that is not positive, or a wall that makes the step unstable.
+        ValueError: for an unknown fluid or command, a size that is not positive, or a wall too light for the step.
     """
 
     name = "cryogenic_tank"
@@ -223,7 +221,6 @@ class CryogenicTank(Plant):
         closure: nn.Module | None = None,
         load: DisturbanceModel | None = None,
         fluid: str = "Hydrogen",
-        wall: Wall = "explicit",
         wall_heat_capacity: float = 500e3,
         cost: TankCost | None = None,
         command: Literal["drop", "duty"] = "drop",
@@ -231,20 +228,17 @@ class CryogenicTank(Plant):
     ):
         constants = ConstantCoefficients.true() if closure is None else closure
         super().__init__(dt=dt, horizon=horizon, closure=constants, observe=observe)
-        for name, value, known in (("command", command, COMMANDS), ("wall", wall, get_args(Wall))):
-            if value not in known:
-                raise ValueError(f"{name}={value!r} does not exist; choose one of {', '.join(known)}.")
+        if command not in COMMANDS:
+            raise ValueError(f"command={command!r} does not exist; choose one of {', '.join(COMMANDS)}.")
         if not 0.0 < wall_heat_capacity < math.inf:
             raise ValueError(f"wall_heat_capacity={wall_heat_capacity} J/K must be positive and finite.")
         self.load = CyclicLoad() if load is None else load
-        self.wall, self.wall_heat_capacity = wall, float(wall_heat_capacity)
+        self.wall_heat_capacity = float(wall_heat_capacity)
         self.command, self.actions = command, (COMMANDS[command],)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)
-        if wall == "explicit":
-            mode = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K"
-            rate = self.wall_rate(self.closure)
-            require_stable_step(self.name, dt, rate, mode=mode, remedy="wall='exponential'")
+        mode, rate = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K", self.wall_rate(self.closure)
+        require_stable_step(self.name, dt, rate, mode=mode, remedy="a heavier wall")
 
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:
@@ -339,33 +333,6 @@ class CryogenicTank(Plant):
         Q_sf = now.wall_conductance * (state[..., 0] - now.tank.T)
         wall = (exogenous[..., 0] - Q_sf) / self.wall_heat_capacity
         return torch.stack([wall, *self.mixture_rates(state[..., 1], now, Q_sf)], -1)
-
-    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
-        r"""The state after Δt; with ``wall="exponential"`` the wall follows the solution of its own equation.
-
-        T and G = U_s A_s keep their values at the start, with which the wall rises by
-
-        .. math:: \Delta T_s = \big(Q_h/G - (T_s - T)\big)\,\big(1 - e^{-G\Delta t/(m_sc_s)}\big).
-
-        The mixture receives the mean of Q_sf that closes the wall's balance, :math:`Q_h - m_sc_s\Delta T_s/\Delta t`.
-        No energy is lost, and a wall of any heat capacity is stable. T_s then lags behind T by up to one interval,
-        about 1e-4 K. The engine ``odeint_adjoint`` integrates the vector field itself with the wall, and therefore
-        still needs a wall that is stable.
-        """
-        if self.wall == "explicit":
-            return super().advance(t, state, applied, exogenous, closure)
-        T_s, load = state[..., :1], exogenous[..., 0]
-        start = self.conditions(state, applied, closure)
-        G, C = start.wall_conductance, self.wall_heat_capacity
-        rise = -torch.expm1(-G * self.dt / C) * (load / G - (T_s[..., 0] - start.tank.T))
-        Q_sf = load - C * rise / self.dt
-
-        def mixture(t: Tensor, s: Tensor) -> Tensor:
-            now = self.conditions(torch.cat([T_s, s], -1), applied, closure)
-            return torch.stack(self.mixture_rates(s[..., 0], now, Q_sf), -1)
-
-        end = rk4_step(mixture, t, state[..., 1:], self.dt)
-        return torch.cat([T_s + rise.unsqueeze(-1), end], -1)
 
     # The control problem
 

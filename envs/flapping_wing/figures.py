@@ -1,6 +1,5 @@
 """Figures of the flapping-wing drone: its flight, the polars of its wings, its policies, and an animation."""
 
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -213,32 +212,15 @@ def control_surfaces(snapshot: Snapshot) -> Figure:
     return figure
 
 
-def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
-    """Write the last real flight as a GIF, in real time if it lasts five seconds.
+def scene(snapshot: Snapshot) -> Scene:
+    """The last real flight as an animation, in real time if it lasts five seconds.
 
     The drone is drawn enlarged: its body, its stroke plane with the pitch β_w and a length proportional to A_φ, the
     normal along which it is pushed, and the wing at its phase in the stroke. At 25 frames per second a beat of 20 Hz
     looks like a beat of 5 Hz.
-
-    Args:
-        snapshot: snapshot with the flight.
-        path: path of the file, which ends in ``.gif``.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        ValueError: if the file has another suffix.
     """
-    return scene(snapshot).save(len(snapshot.record.states), path)
-
-
-def scene(snapshot: Snapshot) -> Scene:
-    """The picture at any sample of the record."""
-    plant, place = cast(FlappingWing, snapshot.plant), array(snapshot.record.states)[:, :2]
-    # The sample at the end has no interval of its own; it shows the last interval.
-    held = np.minimum(np.arange(len(place)), len(snapshot.record.actions) - 1)
-    actions, wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
+    plant, place = cast(FlappingWing, snapshot.plant), array(snapshot.record.states)[:-1, :2]
+    actions, wind = array(snapshot.record.actions), array(snapshot.record.exogenous)[:, 0]
 
     def draw(ax: Axes) -> tuple[list[Artist], Show]:
         target = array(plant.target)
@@ -257,7 +239,7 @@ def scene(snapshot: Snapshot) -> Scene:
         arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **look)
         note = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
 
-        def show(k: int) -> tuple[str, str]:
+        def show(k: int) -> str:
             (A_phi, beta_w), t = actions[k], k * plant.dt
             along, across = _stroke_axes(np.radians(beta_w))
             reach = 0.075 * (high[0] - low[0]) * A_phi / plant.actions[0].high
@@ -269,7 +251,7 @@ def scene(snapshot: Snapshot) -> Scene:
             body.set_data(*place[k][:, None])
             arrow.set_UVC([-wind[k]], [0.0])
             note.set_text(f"headwind {round(wind[k], 1) + 0.0:.1f} m/s")
-            return f"time {t:.2f} s", rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
+            return rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
 
         return [trail, plane, normal, wing, body, arrow, note], show
 

@@ -1,6 +1,5 @@
 """Figures of the wind turbine: its set-points, its power coefficient, the agreement of its twin, and an animation."""
 
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -132,33 +131,16 @@ ARROW = 3.0
 """Length of the wind's arrow for each m/s [m]."""
 
 
-def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
-    """Write the last real episode as a GIF of five seconds.
+@torch.no_grad()
+def scene(snapshot: Snapshot) -> Scene:
+    """The last real episode as an animation.
 
     The rotor is seen from the front. Its blades turn as much slower than the real ones as the episode is quicker, and
     narrow with the pitch; the arrow is the wind. Beside it stand wind, generator speed, power and pitch up to the
     present, with the references that the paper's cost follows.
-
-    Args:
-        snapshot: snapshot with the episode.
-        path: path of the file, which ends in ``.gif``.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        ValueError: if the file has another suffix.
     """
-    return scene(snapshot).save(len(snapshot.record.actions), path)
-
-
-@torch.no_grad()
-def scene(snapshot: Snapshot) -> Scene:
-    """The picture at the start of any interval of the record."""
     plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state, wind, pitch = record.states[:-1], array(record.exogenous[:, 0]), array(record.actions[:, 1])
-    time, label = style.time_axis(plant, len(state))
-    unit = label.removeprefix("time [").removesuffix("]")
     # The angle of a frame is the sum of what the frames before it have turned.
     shown = shown_samples(len(state))
     turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
@@ -175,7 +157,7 @@ def scene(snapshot: Snapshot) -> Scene:
         arrow = ax.quiver([-90.0], [150.0], [0.0], [0.0], color=SAMPLES, width=0.012, **units)
         note = ax.text(-90.0, 156.0, "", fontsize=9)
 
-        def show(k: int) -> tuple[str, str]:
+        def show(k: int) -> str:
             width = 0.5 * CHORD * np.cos(np.radians(pitch[k]))
             outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
             for number, blade in enumerate(blades):
@@ -184,7 +166,7 @@ def scene(snapshot: Snapshot) -> Scene:
                 blade.set_xy(outline @ turn + [0.0, HUB])
             arrow.set_UVC([ARROW * wind[k]], [0.0])
             note.set_text(f"wind {wind[k]:.1f} m/s")
-            return f"time {time[k]:.0f} {unit}", f"pitch {pitch[k]:.1f} deg"
+            return f"pitch {pitch[k]:.1f} deg"
 
         return [*blades, hub, arrow, note], show
 

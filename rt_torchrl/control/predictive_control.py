@@ -2,12 +2,11 @@
 
 import copy
 import dataclasses
-import functools
 import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, descend
+from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, TerminalCost, descend
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
@@ -30,8 +29,6 @@ Variables = Float[np.ndarray, "variables n_a"]
 """Held commands in [0, 1] that several futures share, and below them those of each."""
 PAIRS = 10
 """Number of pairs that approximate the curvature in a solve."""
-Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
 FUTURES = 4
 """Number of pairs of futures of a scattered forecast."""
 
@@ -136,11 +133,6 @@ class _LateError(Exception):
     """The deadline of a solve has passed."""
 
 
-def _after(tail: Tail, t: float, exogenous: Float[Tensor, " n_z"], state: State) -> Tensor:
-    """A tail as a function of the end states alone."""
-    return tail(state.new_full((len(state),), t), state, exogenous.expand(len(state), -1))
-
-
 class RecedingHorizon:
     r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
 
@@ -158,8 +150,7 @@ class RecedingHorizon:
         closure: closure of the model; a twin's closure may be trained while the controller acts.
         config: parameters.
         forecast: forecast of the exogenous inputs; None holds what is measured.
-        tail: cost V after the horizon, of the time, the end states and the inputs there, of several futures their mean,
-            in units of L_a·s; None for none.
+        terminal: cost V after the horizon, a function of the end states, in units of L_a·s; None for none.
 
     Raises:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
@@ -172,7 +163,7 @@ class RecedingHorizon:
         config: PredictiveConfig,
         *,
         forecast: Forecast | None = None,
-        tail: Tail | None = None,
+        terminal: TerminalCost | None = None,
     ):
         self.plant, self.config = plant, config
         self.forecast: Forecast = forecast or Held()
@@ -181,7 +172,7 @@ class RecedingHorizon:
         self.period = hold if config.period is None else self._whole("period", config.period, hold)
         if self.period > self.horizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
-        self.cost, self._tail = CommandCost(plant, constant(closure), hold=hold), tail
+        self.cost = CommandCost(plant, constant(closure), hold=hold, terminal=terminal)
         self._descent = BoundedDescentConfig(
             iterations=config.iterations, tolerance=config.tolerance, gradient=0.0, memory=PAIRS
         )
@@ -239,8 +230,6 @@ class RecedingHorizon:
             safe_point()
             begins, coming = state[episode].expand(inputs.shape[1], -1), inputs[episode]
             began = time.perf_counter()
-            if self._tail is not None:
-                self.cost.terminal = functools.partial(_after, self._tail, t + n * self.plant.dt, coming[:, -1].mean(0))
             self.cost.begin(begins, coming, start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
@@ -434,6 +423,5 @@ class PredictiveControl(nn.Module):
         # The machine code of a solve cannot be copied.
         found = PredictiveControl(self._plant[0], copy.deepcopy(self.closure, memo), self._config)
         found.load_state_dict(self.state_dict())
-        found.value = self.value
         memo[id(self)] = found
         return found

@@ -20,8 +20,8 @@ RATE = 25
 """Frames per second."""
 DOTS = 80
 """Dots per inch."""
-Show = Callable[[int], tuple[str, str]]
-"""Function that moves a drawing to a sample, and returns the label above it and the note beside the label."""
+Show = Callable[[int], str]
+"""Function that moves a drawing to a control interval, and returns the note above it, beside the time."""
 Draw = Callable[[Axes], tuple[Sequence[Artist], Show]]
 """Function that draws a plant, and returns what moves, in the order in which it is drawn over the rest."""
 
@@ -60,7 +60,7 @@ class Trace(NamedTuple):
 
 
 class Scene:
-    """A drawing of a plant on the left, with a caption that moves, beside one trace below the other on the right.
+    """A drawing of a plant at every control interval, under the time, beside traces below each other on the right.
 
     Args:
         snapshot: snapshot with the episode.
@@ -81,7 +81,10 @@ class Scene:
         traces: Sequence[Trace] = (),
         width_ratios: tuple[float, ...] = (1.0,),
     ):
-        time, label = style.time_axis(snapshot.plant, len(snapshot.record.actions))
+        self.intervals = len(snapshot.record.actions)
+        time, label = style.time_axis(snapshot.plant, self.intervals)
+        self._time, self._unit = time, label.removeprefix("time [").removesuffix("]")
+        self._decimals = max(0, 2 - int(np.log10(time[-1])))
         named = f"{title}, episode {style.last_episode(snapshot)}"
         shape = len(traces) or 1, len(width_ratios)
         self.figure, axes = style.panels(*shape, title=named, size=size, width_ratios=width_ratios)
@@ -102,20 +105,18 @@ class Scene:
         self.moving = [*drawn, self._label, self._note, *(artist for moving, _ in self.traces for artist in moving)]
 
     def show(self, k: int) -> None:
-        """Move everything to sample ``k``."""
+        """Move everything to the start of interval ``k``."""
         for _, show in self.traces:
             show(k)
-        label, note = self._show(k)
-        self._label.set_text(label)
-        self._note.set_text(note)
+        self._label.set_text(f"time {self._time[k]:.{self._decimals}f} {self._unit}")
+        self._note.set_text(self._show(k))
 
-    def save(self, samples: int, path: Path | str) -> Path:
-        """Write a GIF of at most ``FRAMES`` frames, which are spread evenly over the samples, and return its path.
+    def save(self, path: Path | str) -> Path:
+        """Write a GIF of at most ``FRAMES`` frames, spread evenly over the control intervals, and return its path.
 
         The figure keeps the layout of the first frame, and what does not move is drawn once.
 
         Args:
-            samples: number of samples of the record.
             path: path of the file, which ends in ``.gif``.
 
         Raises:
@@ -126,7 +127,7 @@ class Scene:
             raise ValueError(f"path={str(path)!r} of the animation must end in '.gif', the format it is written in.")
         from PIL import Image  # here, because only animations need it
 
-        drawn = self._frames(shown_samples(samples))
+        drawn = self._frames(shown_samples(self.intervals))
         # One palette for all frames, of the first and the last one: to find one for each takes most of the time.
         palette = Image.fromarray(np.concatenate([drawn[0], drawn[-1]])).quantize()
         first, *others = (Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in drawn)

@@ -11,7 +11,6 @@ which computes each interval again from its start. The lanes of the processor's 
 lanes are divided among the threads of torch.
 """
 
-from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -31,12 +30,6 @@ from rt_torchrl.trajectories.engines.code import (
 )
 from rt_torchrl.trajectories.engines.interval import Autograd, CostInterval, Drive, GradientEngine
 from rt_torchrl.trajectories.engines.parallel import Parallel
-
-MEMORY = 2.0**30
-"""Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
-
-Piece = tuple[slice, np.ndarray, np.ndarray]
-"""Intervals with their states and ∂J/∂s at their ends (``n n_s lanes``, or one row that serves all)."""
 
 
 class Native(GradientEngine):
@@ -86,7 +79,7 @@ class Native(GradientEngine):
 
 
 class _Task:
-    """Trajectories that are to be computed, in pieces of time.
+    """Trajectories that are to be computed.
 
     Args:
         code: machine code of the interval.
@@ -101,34 +94,18 @@ class _Task:
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
         self._signals = signals_of(self.drive)
-        in_lanes = 16 * self.lanes * (code.sizes["s"] + code.sizes["x"])
-        length = max(1, int(MEMORY / torch.get_num_threads() / in_lanes))
-        self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
-    def start(self, group: Group) -> np.ndarray:
-        """The initial states of a group, ``n_s lanes``."""
-        found = np.zeros((self.code.sizes["s"], self.lanes))
-        found[: self.initial_state.shape[1]] = group.gather(self.initial_state[None])[0]
-        return found
-
-    def march(self, group: Group, piece: slice, state: np.ndarray) -> np.ndarray:
-        """The states ``n+1 n_s lanes`` of a piece, from the state at its start on."""
-        states = np.empty((piece.stop - piece.start + 1, *state.shape))
-        states[0] = state
-        self.code.march(*self.driving(group, piece), states, self.row, piece.stop - piece.start)
+    def march(self, group: Group) -> np.ndarray:
+        """The states ``n+1 n_s lanes`` of a group."""
+        states = np.empty((self.n + 1, self.code.sizes["s"], self.lanes))
+        states[0] = 0.0
+        states[0, : self.initial_state.shape[1]] = group.gather(self.initial_state[None])[0]
+        self.code.march(*self.driving(group), states, self.row, self.n)
         return states
 
-    def flown(self, group: Group) -> Iterator[tuple[slice, np.ndarray]]:
-        """All pieces with their states."""
-        state = self.start(group)
-        for piece in self.pieces:
-            states = self.march(group, piece, state)
-            yield piece, states
-            state = states[-1]
-
-    def driving(self, group: Group, piece: slice) -> tuple[np.ndarray, int, int, int]:
-        """The drive of a group in a piece, as machine code takes it."""
-        return self._signals, group.first, group.last - 1, piece.start
+    def driving(self, group: Group) -> tuple[np.ndarray, int, int, int]:
+        """The drive of a group, as machine code takes it."""
+        return self._signals, group.first, group.last - 1, 0
 
 
 class _Gradients:
@@ -146,25 +123,24 @@ class _Gradients:
         self._by_drive = np.empty((task.n, task.batch, task.code.sizes["x"])) if driven else None
         self._sweep = task.code.sweeps[driven]
 
-    def sweep(self, group: Group, pieces: Iterable[Piece], *, last: float) -> None:
+    def sweep(self, group: Group, states: np.ndarray, source: np.ndarray, *, last: float = 0.0) -> None:
         """Go back over the trajectories of a group.
 
         Args:
             group: the group.
-            pieces: the pieces from the last one on.
-            last: ∂J/∂s of the last signal at the end of all, beside that of the last piece.
+            states: states at the starts of all intervals, ``n n_s lanes``.
+            source: ∂J/∂s at their ends, or one row that serves all.
+            last: ∂J/∂s of the last signal at the end of all, beside that of the source.
         """
         task = self._task
         costate = np.zeros((task.code.sizes["s"], group.lanes))
         by_weights = np.zeros((self._by_weights.shape[-1], group.lanes))
         costate[-1] = last
-        for piece, states, source in pieces:
-            n, stride = piece.stop - piece.start, int(len(source) > 1)
-            by_drive = np.empty((n, task.code.sizes["x"], group.lanes) if self._by_drive is not None else 0)
-            arrays = costate, task.row, by_drive, by_weights
-            self._sweep(*task.driving(group, piece), states, source, stride, *arrays, n)
-            if self._by_drive is not None:
-                group.scatter(by_drive, self._by_drive[piece])
+        by_drive = np.empty((task.n, task.code.sizes["x"], group.lanes) if self._by_drive is not None else 0)
+        arrays = states, source, int(len(source) > 1), costate, task.row, by_drive, by_weights
+        self._sweep(*task.driving(group), *arrays, task.n)
+        if self._by_drive is not None:
+            group.scatter(by_drive, self._by_drive)
         group.scatter(costate[None, : self._by_state.shape[-1]], self._by_state)
         group.scatter(by_weights[None], self._by_weights)
 
@@ -186,11 +162,7 @@ class _EndStates(torch.autograd.Function):
     def forward(ctx: Any, task: _Task, *leaves: Tensor) -> Tensor:
         ends = np.empty((task.n, *task.initial_state.shape))
 
-        def work(group: Group) -> None:
-            for piece, states in task.flown(group):
-                group.scatter(states[1:], ends[piece])
-
-        for_each_group(task.batch, task.lanes, work)
+        for_each_group(task.batch, task.lanes, lambda group: group.scatter(task.march(group)[1:], ends))
         found = torch.from_numpy(ends)
         ctx.task = task
         # What is saved tells autograd when it is changed between forward and backward, the weights too.
@@ -204,11 +176,10 @@ class _EndStates(torch.autograd.Function):
         starts = np.concatenate([task.initial_state[None], ends[:-1]])
         gradients = _Gradients(task, driven=any(ctx.needs_input_grad[2:5]))
 
-        def way_back(group: Group) -> Iterator[Piece]:
-            for piece in reversed(task.pieces):
-                yield piece, group.gather(starts[piece]), group.gather(sources[piece])
+        def work(group: Group) -> None:
+            gradients.sweep(group, group.gather(starts), group.gather(sources))
 
-        for_each_group(task.batch, task.lanes, lambda group: gradients.sweep(group, way_back(group), last=0.0))
+        for_each_group(task.batch, task.lanes, work)
         return None, *gradients.weighed(np.ones(task.batch))
 
 
@@ -222,19 +193,10 @@ class _Costs(torch.autograd.Function):
         gradients = ctx.gradients = _Gradients(task, driven=driven) if wanted else None
 
         def work(group: Group) -> None:
-            starts = []
-            for _, states in task.flown(group):
-                starts.append(states[0].copy())
+            states = task.march(group)
             costs[group.first : group.last] = states[-1, -1, : group.live]
-
-            def way_back() -> Iterator[Piece]:
-                held = states  # those of the last piece are still there
-                for piece in reversed(task.pieces):
-                    start = starts.pop()
-                    yield piece, held if piece.stop == task.n else task.march(group, piece, start), nothing
-
             if gradients is not None:
-                gradients.sweep(group, way_back(), last=1.0)
+                gradients.sweep(group, states, nothing, last=1.0)
 
         for_each_group(task.batch, task.lanes, work)
         ctx.n = task.n
