@@ -19,7 +19,7 @@ from rt_torchrl.plants.signal import Signal
 TIME = "time"
 READERS = (".csv", ".parquet")
 """Ends of the names of files that are read, in small letters."""
-NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
+NUMBER = r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|inf|nan)"
 COLUMN = re.compile(
     rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
     re.DOTALL,
@@ -27,6 +27,10 @@ COLUMN = re.compile(
 EXAMPLES = "write it as in rpm, m/s^2, kN m, degC."
 WITH_OFFSET = r"\d[Tt ].*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
 """A date whose time of day says by how much it is ahead of UTC."""
+
+
+Rows = Float[np.ndarray, " rows"]
+"""Values of a column."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +78,11 @@ class Column:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.unit is not None and (self.factor, self.offset) != (1.0, 0.0):
+        scaled = (self.factor, self.offset) != (1.0, 0.0)
+        if not self.factor or (scaled and self.unit is not None):
             raise ValueError(
-                f"column {self.header!r} has unit={self.unit!r}, and factor={self.factor} and offset={self.offset} "
-                "beside it; give one or the other."
-            )
-        if not (np.isfinite(self.factor) and self.factor != 0.0 and np.isfinite(self.offset)):
-            raise ValueError(
-                f"column {self.header!r} has factor={self.factor} and offset={self.offset}; both must be finite and "
-                "the factor not zero."
+                f"column {self.header!r} has unit={self.unit!r}, factor={self.factor} and offset={self.offset}; give "
+                "one or the other: a unit, or a finite factor that is not zero, and an offset."
             )
 
     @classmethod
@@ -93,17 +93,13 @@ class Column:
             ValueError: if the text has another form.
         """
         match = COLUMN.fullmatch(text.strip())
-        found = match.groupdict() if match else {}
-        try:
-            factor, offset = (float(found[key] or default) for key, default in (("factor", 1.0), ("offset", 0.0)))
-        except (KeyError, ValueError):
+        if match is None:
             raise ValueError(
                 f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
                 "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
-            ) from None
-        return cls(
-            header=found["header"], signal=found["signal"], factor=factor, offset=offset, unit=found["unit"] or None
-        )
+            )
+        header, signal, unit, factor, offset = match.group("header", "signal", "unit", "factor", "offset")
+        return cls(header=header, signal=signal, factor=float(factor or 1.0), offset=float(offset or 0.0), unit=unit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +119,8 @@ class SensorLog:
         ValueError: if the times are not finite and increasing, or a column has another length.
     """
 
-    times: Float[np.ndarray, " rows"]
-    columns: dict[str, Float[np.ndarray, " rows"]]
+    times: Rows
+    columns: dict[str, Rows]
     cuts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -213,30 +209,28 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Sensor
     """
     frame = _read(path)
     headers = list(frame)
-    names = [signal.name for signal in logged_signals(plant)]
+    units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
     for column in columns:
-        if column.header.strip() not in headers or column.signal not in (TIME, *names):
+        if column.header.strip() not in headers or column.signal not in units:
             raise ValueError(
                 f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(headers)}; "
-                f"plant {plant.name!r} has the signals {', '.join((TIME, *names))}."
+                f"plant {plant.name!r} has the signals {', '.join(units)}."
             )
     declared = {column.signal: column for column in columns}
     if len(declared) < len(columns):
         raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; give each signal one column.")
-    by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in headers}
-    chosen = by_name | declared
+    chosen = {name: Column(header=name, signal=name) for name in units if name in headers} | declared
     if TIME not in chosen:
         raise ValueError(
             f"{path} has no column 'time'; it has {', '.join(headers)}. Say which it is, such as --columns t=time. In "
             "CSV files, commas part the columns."
         )
     for column in chosen.values():
-        if headers.count(column.header.strip()) > 1:
+        if (count := headers.count(column.header.strip())) > 1:
             raise ValueError(
-                f"column {column.header!r} for {column.signal!r} is there {headers.count(column.header.strip())} times "
-                f"in {path}, which has the columns {', '.join(headers)}; give each a header of its own."
+                f"column {column.header!r} for {column.signal!r} is there {count} times in {path}, which has the "
+                f"columns {', '.join(headers)}; give each a header of its own."
             )
-    units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
     values = {name: _values(frame[column.header.strip()], column, units[name], path) for name, column in chosen.items()}
     return SensorLog(times=values.pop(TIME), columns=values)
 
@@ -282,9 +276,9 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
 
 
 def _read(path: Path) -> Any:
+    """The table of a file, with its headers."""
     readers = dict(zip(READERS, (_read_csv, _read_parquet), strict=True))
-    kind = path.suffix.lower()
-    if kind not in readers:
+    if (kind := path.suffix.lower()) not in readers:
         raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
     try:
         frame = readers[kind](path)
@@ -295,35 +289,28 @@ def _read(path: Path) -> Any:
 
 
 def _read_csv(path: Path) -> Any:
-    """The table with the columns as the header says; pandas alone would shift or fill the entries of ragged lines."""
-    headers = _headers(path)
-    frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
-    # pandas gives a name to a column without one, and another name to a header that is there twice.
-    frame.columns = [header or given for header, given in zip(headers, frame, strict=True)]
-    return frame
-
-
-def _headers(path: Path) -> list[str]:
-    """The headers of a CSV file, after a look at every line.
+    """The table with the columns as the header says, after a look at every line: pandas would shift ragged ones.
 
     Raises:
         ValueError: if there is no header, or a line lacks entries or has some behind the last header.
     """
     with path.open(newline="", encoding="utf-8-sig") as file:
         lines = csv.reader(file)
-        rows = (row for row in lines if row and not (len(row) == 1 and not row[0].strip()))  # blank lines do not count
+        rows = (row for row in lines if any(entry.strip() for entry in row) or len(row) > 1)  # no blank lines
         headers = [header.strip() for header in next(rows, [])]
-        n = len(headers)
         least = max((k for k, header in enumerate(headers, 1) if header), default=0)
         if not least:
             raise ValueError("it has no header")
         for row in rows:
-            if len(row) != n and (len(row) < least or any(entry.strip() for entry in row[n:])):
+            if len(row) < least or any(entry.strip() for entry in row[len(headers) :]):
                 raise ValueError(
-                    f"line {lines.line_num} has {len(row)} entries; the header has {n}: {', '.join(headers)}. Mend the "
-                    "line or the header"
+                    f"line {lines.line_num} has {len(row)} entries; the header has {len(headers)}: "
+                    f"{', '.join(headers)}. Mend the line or the header"
                 )
-    return headers
+    frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
+    # pandas gives a name to a column without one, and another name to a header that is there twice.
+    frame.columns = [header or given for header, given in zip(headers, frame, strict=True)]
+    return frame
 
 
 def _read_parquet(path: Path) -> Any:
@@ -332,68 +319,64 @@ def _read_parquet(path: Path) -> Any:
     return frame.reset_index() if any(name is not None for name in frame.index.names) else frame
 
 
-def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:
+def _values(series: Any, column: Column, unit: str, path: Path) -> Rows:
     """Numbers of a column in the signal's unit; a date becomes the seconds since the first date."""
-    pd = pandas()
     if series.empty:
         return np.empty(0)
-    of_clock = pd.api.types.is_datetime64_any_dtype(series) or pd.api.types.is_timedelta64_dtype(series)
-    try:
-        numbers = None if of_clock else pd.to_numeric(series)
-    except (ValueError, TypeError):
-        text = series.astype(str).str.strip().str.lower()
-        wrong = pd.to_numeric(series, errors="coerce").isna() & series.notna() & ~text.isin(("", "nan"))
+    pd, about = pandas(), f"column {column.header!r} of {path}"
+    dated = pd.api.types.is_datetime64_any_dtype(series) or pd.api.types.is_timedelta64_dtype(series)
+    numbers = series.map(lambda entry: np.nan) if dated else pd.to_numeric(series, errors="coerce")
+    blank = series.isna() | series.astype(str).str.strip().str.lower().isin(("", "nan"))
+    wrong = numbers.isna() & ~blank
+    if wrong.any():
         if column.signal != TIME or not wrong[series.notna()].all():
-            raise _wrong_entry(series, wrong, column, path, "a number") from None
-        numbers = None
-    if numbers is None:
-        if column.signal != TIME:
-            raise ValueError(f"column {column.header!r} of {path} holds dates; {column.signal} needs numbers.")
+            what = (
+                f"dates; {column.signal} needs numbers."
+                if dated
+                else f"an entry that is {_entry(series, wrong, 'a number')}"
+            )
+            raise ValueError(f"{about} holds {what}")
         if column.unit is not None:
-            raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
-        numbers = _seconds(series, column, path)
-    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
-    if column.unit is None:
-        return column.factor * values + column.offset
+            raise ValueError(f"{about} holds dates; leave its unit {column.unit!r} away.")
+        numbers = _seconds(series, about)
+    values = column.factor * numbers.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
     try:
-        return converted(values, column.unit, unit)
+        return values if column.unit is None else converted(values, column.unit, unit)
     except ValueError as error:
-        raise ValueError(f"column {column.header!r} of {path} for signal {column.signal!r}: {error}") from error
+        raise ValueError(f"{about} for signal {column.signal!r}: {error}") from error
 
 
-def _seconds(series: Any, column: Column, path: Path) -> Any:
+def _seconds(series: Any, about: str) -> Any:
     """Durations in seconds, or the seconds of dates since the first one."""
     pd = pandas()
     if pd.api.types.is_timedelta64_dtype(series):
         return series.dt.total_seconds()
     if pd.api.types.is_datetime64_any_dtype(series):
-        found = pd.to_datetime(series, utc=True)
+        dates = pd.to_datetime(series, utc=True)
     else:
         text, there = series.astype(str), series.notna()
-        found = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
+        dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
         durations = pd.to_timedelta(text, errors="coerce")
-        dates = int(found.notna().sum()) >= int(durations.notna().sum())
-        found = found if dates else durations
-        if (found.isna() & there).any():
-            raise _wrong_entry(series, found.isna() & there, column, path, "a date (ISO 8601) or a duration (0:01:30)")
-        if not dates:
-            return found.dt.total_seconds()
+        as_dates = dates.notna().sum() >= durations.notna().sum()
         offset = text.str.contains(WITH_OFFSET)
-        other = there & (offset != offset[there].iloc[0])
-        if other.any():
-            raise _wrong_entry(series, other, column, path, "like the first one: with an offset from UTC, or without")
-    return (found - found.dropna().iloc[0]).dt.total_seconds()
+        faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}
+        if as_dates:
+            faults["like the first one: with an offset from UTC, or without"] = offset != offset[there].iloc[0]
+        for what, wrong in faults.items():
+            if (wrong & there).any():
+                raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & there, what)}")
+        if not as_dates:
+            return durations.dt.total_seconds()
+    return (dates - dates.dropna().iloc[0]).dt.total_seconds()
 
 
-def _wrong_entry(series: Any, wrong: Any, column: Column, path: Path, what: str) -> ValueError:
+def _entry(series: Any, wrong: Any, what: str) -> str:
+    """The first entry that is not what it should be, for a message."""
     k = int(np.argmax(wrong.to_numpy()))
-    return ValueError(
-        f"column {column.header!r} of {path} holds an entry that is not {what}: {series.iloc[k]!r} in row {k} (counted "
-        f"from 0), {int(wrong.sum())} such rows."
-    )
+    return f"not {what}: {series.iloc[k]!r} in row {k} (counted from 0), {int(wrong.sum())} such rows."
 
 
-def converted(values: Float[np.ndarray, " rows"], unit: str, to: str) -> Float[np.ndarray, " rows"]:
+def converted(values: Rows, unit: str, to: str) -> Rows:
     """The values in another unit, converted by the library pint.
 
     To pint an angle is a pure number; here it is not. Hz and rad/s, which differ by 2π, therefore measure different
