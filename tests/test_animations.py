@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from figure_reading import snapshot_of
-from matplotlib.figure import Figure
 from PIL import Image
 
 from rt_torchrl.envs.cryogenic_tank import figures as tank
@@ -14,7 +13,7 @@ from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine import figures as turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures.animation import RATE, Trace, shown_samples
+from rt_torchrl.figures.animation import RATE, shown_samples
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +39,20 @@ def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
 
 def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):
     scene, record = turbine.scene(blowing), blowing.record
-    *blades, _, _, note = scene.moving[:6]
     angles = []
     for k in (7, 8):
         scene.show(k)
+        _, *blades = scene.ax.patches  # the first one is the tower
         tip = blades[0].get_xy()[2:4].mean(0) - [0.0, turbine.HUB]
         assert math.hypot(*tip) == pytest.approx(turbine.TIP)
         angles.append(math.atan2(*tip))
     speed = record.states[8, 0].item() / WindTurbine.rated_rotor_speed
     assert abs(angles[1] - angles[0]) == pytest.approx(math.radians(turbine.TURN * speed))
-    assert note.get_text() == f"wind {record.exogenous[8, 0]:.1f} m/s"
-    line, end = scene.traces[1][0]
-    assert np.array_equal(line.get_ydata(), 97.0 * record.states[:9, 0].numpy())
-    assert end.get_xdata().tolist() == [4.0]
+    texts = [text.get_text() for text in scene.ax.texts]
+    assert texts == [f"wind {record.exogenous[8, 0]:.1f} m/s", "time 4.0 s", f"pitch {record.actions[8, 1]:.1f} deg"]
+    speeds = scene.figure.axes[2].lines
+    assert np.array_equal(speeds[1].get_ydata(), 97.0 * record.states[:-1, 0].numpy())
+    assert speeds[2].get_xdata() == [4.0, 4.0]
 
 
 def test_the_level_is_that_of_a_sphere(boiling):
@@ -60,9 +60,9 @@ def test_the_level_is_that_of_a_sphere(boiling):
         assert tank.level(0.25 * (1.0 + height) ** 2 * (2.0 - height)) == pytest.approx(height, abs=1e-4)
     scene = tank.scene(boiling)
     scene.show(5)
-    surface = scene.moving[0].get_xy()[:, 1].max()
+    surface = scene.ax.patches[0].get_xy()[:, 1].max()
     assert surface == pytest.approx(tank.level(boiling.record.states[5, 1].item() / 60.0), abs=1e-9)
-    assert f"load {boiling.record.exogenous[5, 0]:.0f} W" in scene.moving[5].get_text()
+    assert f"load {boiling.record.exogenous[5, 0]:.0f} W" in scene.ax.texts[0].get_text()
 
 
 def test_frames_are_spread_over_the_samples():
@@ -71,11 +71,6 @@ def test_frames_are_spread_over_the_samples():
     assert len(many) == 125 and many[0] == 0 and many[-1] == 1199
 
 
-def test_a_trace_keeps_its_axes_and_another_format_is_refused(blowing, tmp_path):
-    ax = Figure().subplots()
-    (line, _), show = Trace("x [m]", np.array([0.0, 9.0, 1.0, 2.0])).draw(ax, np.arange(4.0))
-    limits = ax.get_ylim()
-    show(0)
-    assert ax.get_ylim() == limits and line.get_ydata().tolist() == [0.0]
+def test_another_format_is_refused(blowing, tmp_path):
     with pytest.raises(ValueError, match=r"must end in '\.gif'"):
         turbine.scene(blowing).save(tmp_path / "last.mp4")

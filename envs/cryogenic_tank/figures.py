@@ -5,7 +5,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
@@ -14,7 +13,7 @@ from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
 from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene, Show, Trace
+from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
 from rt_torchrl.figures.training import closure_weights, tracked_weights
@@ -236,39 +235,32 @@ def scene(snapshot: Snapshot) -> Scene:
     pressure, fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
     flow, load = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow), array(record.exogenous[:, 0])
 
-    def draw(ax: Axes) -> tuple[list[Artist], Show]:
+    around = np.linspace(0.0, 2.0 * np.pi, 181)
+
+    def draw(ax: Axes, k: int) -> str:
         ax.set(xlim=(-1.9, 1.9), ylim=(-1.3, 2.3), aspect="equal")
         ax.axis("off")
-        around = np.linspace(0.0, 2.0 * np.pi, 181)
-        (liquid,) = ax.fill([0.0], [0.0], color=style.FILTERED, alpha=0.8)
-        (shell,) = ax.plot(np.cos(around), np.sin(around), color=REAL, linewidth=3.0)
+        # From one edge of the surface along the wall to the other.
+        half = np.arccos(-level(fill[k]))
+        angle = np.linspace(-half, half, 91)
+        ax.fill(np.sin(angle), -np.cos(angle), color=style.FILTERED, alpha=0.8)
+        ax.plot(np.cos(around), np.sin(around), color=REAL, linewidth=3.0)
         ax.plot([0.0, 0.0], [1.0, 1.35], color=REAL, linewidth=3.0)
-        (valve,) = ax.plot([0.0], [1.35], marker="D", color=REAL, markersize=8)
-        (puffs,) = ax.plot([], [], "o", color="0.7", markersize=5, alpha=0.8)
+        count = round(PUFFS * flow[k] / (flow.max() or 1.0))
+        ax.plot([0.0], [1.35], marker="D", color=SAMPLES if count else REAL, markersize=8)
+        rise = np.arange(count) / PUFFS
+        puffs = 0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise
+        ax.plot(*puffs, "o", color="0.7", markersize=5, alpha=0.8)
         units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
-        arrow = ax.quiver([-1.75], [0.0], [0.0], [0.0], color=TWIN, width=0.02, **units)
-        note = ax.text(-1.85, -1.25, "", fontsize=9)
+        ax.quiver([-1.75], [0.0], [0.7 * load[k] / load.max()], [0.0], color=TWIN, width=0.02, **units)
+        ax.text(-1.85, -1.25, f"load {load[k]:.0f} W, {100.0 * fill[k]:.1f} % liquid", fontsize=9)
+        return f"{pressure[k]:.0f} kPa"
 
-        def show(k: int) -> str:
-            # From one edge of the surface along the wall to the other.
-            half = np.arccos(-level(fill[k]))
-            angle = np.linspace(-half, half, 91)
-            liquid.set_xy(np.stack([np.sin(angle), -np.cos(angle)], -1))
-            count = round(PUFFS * flow[k] / (flow.max() or 1.0))
-            rise = np.arange(count) / PUFFS
-            puffs.set_data(0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise)
-            valve.set_color(SAMPLES if count else REAL)
-            arrow.set_UVC([0.7 * load[k] / load.max()], [0.0])
-            note.set_text(f"load {load[k]:.0f} W, {100.0 * fill[k]:.1f} % liquid")
-            return f"{pressure[k]:.0f} kPa"
-
-        return [liquid, shell, valve, puffs, arrow, note], show
-
-    traces = [
-        Trace("pressure $p$ [kPa]", pressure, np.full_like(pressure, 1e-3 * plant.set_point)),
-        Trace(r"vent flow $\dot m_c$ [g/s]", flow, look={"linewidth": 0.8, "color": SAMPLES}),
-        Trace(plant.inputs[0].label, load, look={"linewidth": 0.8, "color": TWIN}),
-    ]
+    traces = {
+        "pressure $p$ [kPa]": (pressure, np.full_like(pressure, 1e-3 * plant.set_point)),
+        r"vent flow $\dot m_c$ [g/s]": (flow, None),
+        plant.inputs[0].label: (load, None),
+    }
     return Scene(snapshot, draw, title="Cryogenic tank", size=(9.0, 5.2), traces=traces, width_ratios=(1.0, 1.5))
 
 

@@ -5,7 +5,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,7 +13,7 @@ from torch import Tensor
 from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
 from rt_torchrl.evaluation.checks import visited_features as features_of
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene, Show
+from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
@@ -222,49 +221,34 @@ def scene(snapshot: Snapshot) -> Scene:
     plant, place = cast(FlappingWing, snapshot.plant), array(snapshot.record.states)[:-1, :2]
     actions, wind = array(snapshot.record.actions), array(snapshot.record.exogenous)[:, 0]
 
-    def draw(ax: Axes) -> tuple[list[Artist], Show]:
-        target = array(plant.target)
-        ax.plot(*target, "*", color=style.REFERENCE, markersize=16, label="target")
-        low, high = _square(np.vstack([place, target]))
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    target = array(plant.target)
+    points = np.vstack([place, target])
+    low, high = points.min(0), points.max(0)
+    middle, half = 0.5 * (low + high), 0.6 * max((high - low).max(), 1e-3)  # with a margin for the drone
+
+    def draw(ax: Axes, k: int) -> str:
+        ends = zip(middle - half, middle + half, strict=True)
+        ax.set(**dict(zip(("xlim", "ylim"), ends, strict=True)), aspect="equal")
         ax.set_xlabel(plant.states[0].label)
         ax.set_ylabel(plant.states[1].label)
-        bar: dict[str, Any] = {"solid_capstyle": "round"}
-        (trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
-        (plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
-        (normal,) = ax.plot([], [], color="0.45", linewidth=1.5, label="normal")
-        (wing,) = ax.plot([], [], color=REAL, linewidth=2.5, label="wing", **bar)
-        (body,) = ax.plot([], [], "o", color=REAL, markersize=6)
+        (A_phi, beta_w), t = actions[k], k * plant.dt
+        angle, reach = np.radians(beta_w), 0.15 * half * A_phi / plant.actions[0].high
+        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        wing = np.cos(2.0 * np.pi * plant.frequency * t) * along
+
+        def bar(first: np.ndarray, last: np.ndarray, **look: Any) -> None:
+            ax.plot(*np.stack([place[k] + reach * first, place[k] + reach * last], -1), solid_capstyle="round", **look)
+
+        ax.plot(*target, "*", color=style.REFERENCE, markersize=16, label="target")
+        ax.plot(*place[: k + 1].T, color="0.6", linewidth=1.4)
+        bar(-along, along, color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$")
+        bar(0.0 * across, across, color="0.45", linewidth=1.5, label="normal")
+        bar(0.0 * wing, wing, color=REAL, linewidth=2.5, label="wing")
+        ax.plot(*place[k], "o", color=REAL, markersize=6)
         look: dict[str, Any] = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
-        arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **look)
-        note = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
-
-        def show(k: int) -> str:
-            (A_phi, beta_w), t = actions[k], k * plant.dt
-            along, across = _stroke_axes(np.radians(beta_w))
-            reach = 0.075 * (high[0] - low[0]) * A_phi / plant.actions[0].high
-            phase = np.cos(2.0 * np.pi * plant.frequency * t)
-            trail.set_data(*place[: k + 1].T)
-            plane.set_data(*np.stack([place[k] - reach * along, place[k] + reach * along], -1))
-            wing.set_data(*np.stack([place[k], place[k] + reach * phase * along], -1))
-            normal.set_data(*np.stack([place[k], place[k] + reach * across], -1))
-            body.set_data(*place[k][:, None])
-            arrow.set_UVC([-wind[k]], [0.0])
-            note.set_text(f"headwind {round(wind[k], 1) + 0.0:.1f} m/s")
-            return rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
-
-        return [trail, plane, normal, wing, body, arrow, note], show
+        ax.quiver([0.2], [0.93], [-wind[k]], [0.0], transform=ax.transAxes, **look)
+        text = f"headwind {round(wind[k], 1) + 0.0:.1f} m/s"
+        ax.text(0.2, 0.96, text, transform=ax.transAxes, ha="center", fontsize=9)
+        return rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
 
     return Scene(snapshot, draw, title="Flight", size=(6.2, 6.4))
-
-
-def _stroke_axes(beta_w: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Unit vectors in (x, z) along the stroke plane and across it, upwards; β_w in rad."""
-    return np.array([np.cos(beta_w), np.sin(beta_w)]), np.array([-np.sin(beta_w), np.cos(beta_w)])
-
-
-def _square(points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Corners of a square around all points, with a margin for the drone."""
-    low, high = points.min(0), points.max(0)
-    half = 0.6 * max((high - low).max(), 1e-3)
-    return 0.5 * (low + high) - half, 0.5 * (low + high) + half

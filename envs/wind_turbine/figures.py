@@ -4,14 +4,13 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene, Show, Trace, shown_samples
+from rt_torchrl.figures.animation import Scene, shown_samples
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import FILTERED, REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
 
@@ -146,36 +145,29 @@ def scene(snapshot: Snapshot) -> Scene:
     turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
     angles = dict(zip(shown, np.radians(turned), strict=True))
 
-    def draw(ax: Axes) -> tuple[list[Artist], Show]:
+    omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
+
+    def draw(ax: Axes, k: int) -> str:
         ax.set(xlim=(-95.0, 95.0), ylim=(-5.0, 165.0), aspect="equal")
         ax.axis("off")
         ax.axhline(0.0, color="0.6", linewidth=1.0)
         ax.fill([-3.0, -2.0, 2.0, 3.0], [0.0, HUB, HUB, 0.0], color="0.75")
-        blades = [ax.fill([0.0], [0.0], color=REAL)[0] for _ in range(3)]
-        (hub,) = ax.plot([0.0], [HUB], "o", color=style.REFERENCE, markersize=7)
+        width = 0.5 * CHORD * np.cos(np.radians(pitch[k]))
+        outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
+        for number in range(3):
+            angle = angles[k] + 2.0 * np.pi * number / 3.0
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            ax.fill(*(outline @ turn + [0.0, HUB]).T, color=REAL)
+        ax.plot([0.0], [HUB], "o", color=style.REFERENCE, markersize=7)
         units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
-        arrow = ax.quiver([-90.0], [150.0], [0.0], [0.0], color=SAMPLES, width=0.012, **units)
-        note = ax.text(-90.0, 156.0, "", fontsize=9)
+        ax.quiver([-90.0], [150.0], [ARROW * wind[k]], [0.0], color=SAMPLES, width=0.012, **units)
+        ax.text(-90.0, 156.0, f"wind {wind[k]:.1f} m/s", fontsize=9)
+        return f"pitch {pitch[k]:.1f} deg"
 
-        def show(k: int) -> str:
-            width = 0.5 * CHORD * np.cos(np.radians(pitch[k]))
-            outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
-            for number, blade in enumerate(blades):
-                angle = angles[k] + 2.0 * np.pi * number / 3.0
-                turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-                blade.set_xy(outline @ turn + [0.0, HUB])
-            arrow.set_UVC([ARROW * wind[k]], [0.0])
-            note.set_text(f"wind {wind[k]:.1f} m/s")
-            return f"pitch {pitch[k]:.1f} deg"
-
-        return [*blades, hub, arrow, note], show
-
-    omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
-    speed_wanted, power_wanted = plant.reference_speed(state[:, 2]), 1e-6 * plant.reference_power(omega_g)
-    traces = [
-        Trace(WIND_LABEL, wind, look={"linewidth": 0.8, "color": SAMPLES}),
-        Trace(SPEED_LABEL, array(omega_g), array(speed_wanted)),
-        Trace("generator power [MW]", array(power), array(power_wanted)),
-        Trace(PITCH_LABEL, pitch),
-    ]
+    traces = {
+        WIND_LABEL: (wind, None),
+        SPEED_LABEL: (array(omega_g), array(plant.reference_speed(state[:, 2]))),
+        "generator power [MW]": (array(power), 1e-6 * array(plant.reference_power(omega_g))),
+        PITCH_LABEL: (pitch, None),
+    }
     return Scene(snapshot, draw, title="Wind turbine", size=(9.0, 5.6), traces=traces, width_ratios=(1.15, 1.0))

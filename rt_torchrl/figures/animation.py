@@ -1,14 +1,15 @@
-"""Animations of the last real episode: a drawing of the plant, traces with a moving end beside it, and the file."""
+"""Animations of the last real episode: a drawing of the plant, traces with a moving cursor beside it, and the file."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.lines import Line2D
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.figures import style
@@ -20,43 +21,10 @@ RATE = 25
 """Frames per second."""
 DOTS = 80
 """Dots per inch."""
-Show = Callable[[int], str]
-"""Function that moves a drawing to a control interval, and returns the note above it, beside the time."""
-Draw = Callable[[Axes], tuple[Sequence[Artist], Show]]
-"""Function that draws a plant, and returns what moves, in the order in which it is drawn over the rest."""
-
-
-class Trace(NamedTuple):
-    """A quantity over time, drawn up to the present sample, with its setpoint drawn whole.
-
-    Args:
-        label: label of the quantity with its unit.
-        values: values of the samples.
-        setpoint: setpoint at the samples; None for none.
-        look: further options of the line.
-    """
-
-    label: str
-    values: np.ndarray
-    setpoint: np.ndarray | None = None
-    look: Mapping[str, Any] = {}
-
-    def draw(self, ax: Axes, time: np.ndarray) -> tuple[list[Artist], Callable[[int], None]]:
-        """Draw the whole trace, which keeps its axes; return what moves, and the function that moves it."""
-        if self.setpoint is not None:
-            ax.plot(time, self.setpoint, **style.REFERENCE_LINE)
-        look: dict[str, Any] = {"color": style.REAL, "linewidth": 1.3} | dict(self.look)
-        (line,) = ax.plot(time, self.values, **look)
-        (end,) = ax.plot(time[-1:], self.values[-1:], "o", color=look["color"], markersize=4)
-        ax.set_xlim(time[0], time[-1])
-        ax.set_ylim(ax.get_ylim())
-        style.caption(ax, self.label)
-
-        def show(k: int) -> None:
-            line.set_data(time[: k + 1], self.values[: k + 1])
-            end.set_data(time[k : k + 1], self.values[k : k + 1])
-
-        return [line, end], show
+Draw = Callable[[Axes, int], str]
+"""Function that draws a plant into empty axes at the start of a control interval, and returns the note above it."""
+Trace = tuple[np.ndarray, np.ndarray | None]
+"""Values of a quantity in all control intervals, and its setpoint if it has one."""
 
 
 class Scene:
@@ -67,7 +35,7 @@ class Scene:
         draw: function that draws the plant.
         title: what the picture shows; the number of the episode follows.
         size: width and height of the figure [inch].
-        traces: the traces, of a value for each control interval.
+        traces: the traces by their labels, under a cursor at the present time.
         width_ratios: widths of drawing and traces.
     """
 
@@ -78,43 +46,50 @@ class Scene:
         *,
         title: str,
         size: tuple[float, float],
-        traces: Sequence[Trace] = (),
+        traces: Mapping[str, Trace] | None = None,
         width_ratios: tuple[float, ...] = (1.0,),
     ):
-        self.intervals = len(snapshot.record.actions)
+        self.intervals, shown = len(snapshot.record.actions), traces or {}
         time, label = style.time_axis(snapshot.plant, self.intervals)
-        self._time, self._unit = time, label.removeprefix("time [").removesuffix("]")
+        self._draw, self._time, self._unit = draw, time, label.removeprefix("time [").removesuffix("]")
         self._decimals = max(0, 2 - int(np.log10(time[-1])))
-        named = f"{title}, episode {style.last_episode(snapshot)}"
-        shape = len(traces) or 1, len(width_ratios)
+        named, shape = f"{title}, episode {style.last_episode(snapshot)}", (len(shown) or 1, len(width_ratios))
         self.figure, axes = style.panels(*shape, title=named, size=size, width_ratios=width_ratios)
         for ax in axes[1:, 0]:
             ax.remove()
         self.ax = axes[0, 0]
         self.ax.set_subplotspec(self.ax.get_gridspec()[:, 0])
-        self.traces = [trace.draw(ax, time[:-1]) for ax, trace in zip(axes[:, -1], traces, strict=False)]
-        if traces:
-            for ax in axes[:-1, -1]:
-                ax.tick_params(labelbottom=False)
+        self._cursors, self._drawn = list[Line2D](), list[Artist]()
+        for ax, (name, (values, setpoint)) in zip(axes[:, -1], shown.items(), strict=False):
+            if setpoint is not None:
+                ax.plot(time[:-1], setpoint, **style.REFERENCE_LINE)
+            ax.plot(time[:-1], values, color=style.REAL, linewidth=1.0)
+            self._cursors.append(ax.axvline(0.0, color=style.TWIN, linewidth=1.2))
+            ax.set_xlim(0.0, time[-1])
+            ax.tick_params(labelbottom=False)
+            style.caption(ax, name)
+        if shown:
+            axes[-1, -1].tick_params(labelbottom=True)
             axes[-1, -1].set_xlabel(label)
-        above: dict[str, Any] = {"transform": self.ax.transAxes, "va": "bottom"}
-        self._label = self.ax.text(0.0, 1.01, " ", ha="left", fontsize=9.5, **above)
-        self._note = self.ax.text(1.0, 1.01, " ", ha="right", fontsize=9, color="0.35", **above)
-        drawn, self._show = draw(self.ax)
+        self.show(0)
         style.legend_below(self.figure, [self.ax])
-        self.moving = [*drawn, self._label, self._note, *(artist for moving, _ in self.traces for artist in moving)]
 
-    def show(self, k: int) -> None:
-        """Move everything to the start of interval ``k``."""
-        for _, show in self.traces:
-            show(k)
-        self._label.set_text(f"time {self._time[k]:.{self._decimals}f} {self._unit}")
-        self._note.set_text(self._show(k))
+    def show(self, k: int) -> list[Artist]:
+        """Draw the start of control interval ``k``, and return what moves in the order in which it is drawn."""
+        for cursor in self._cursors:
+            cursor.set_xdata([self._time[k], self._time[k]])
+        for artist in self._drawn:
+            artist.remove()
+        note = self._draw(self.ax, k)
+        still: dict[str, Any] = {"transform": self.ax.transAxes, "va": "bottom"}
+        moment = f"time {self._time[k]:.{self._decimals}f} {self._unit}"
+        self.ax.text(0.0, 1.01, moment, ha="left", fontsize=9.5, **still)
+        self.ax.text(1.0, 1.01, note, ha="right", fontsize=9, color="0.35", **still)
+        self._drawn = [*self.ax.collections, *self.ax.patches, *self.ax.lines, *self.ax.texts]
+        return [*self._cursors, *sorted(self._drawn, key=Artist.get_zorder)]
 
     def save(self, path: Path | str) -> Path:
         """Write a GIF of at most ``FRAMES`` frames, spread evenly over the control intervals, and return its path.
-
-        The figure keeps the layout of the first frame, and what does not move is drawn once.
 
         Args:
             path: path of the file, which ends in ``.gif``.
@@ -136,21 +111,19 @@ class Scene:
         write_atomically(path, file.getvalue())
         return path
 
-    def _frames(self, samples: Sequence[int]) -> list[np.ndarray]:
-        """Pixels of each frame, (height, width, 3) of ``uint8``."""
+    def _frames(self, intervals: Sequence[int]) -> list[np.ndarray]:
+        """Pixels of each frame, (height, width, 3) of ``uint8``; what does not move is drawn once."""
         self.figure.set_dpi(DOTS)
-        canvas = FigureCanvasAgg(self.figure)
-        self.show(0)
+        canvas, frames = FigureCanvasAgg(self.figure), []
         self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")
-        for artist in self.moving:
+        self.figure.set_layout_engine("none")  # every frame has the layout of the first one
+        for artist in self.show(0):
             artist.set_animated(True)
         canvas.draw()
-        still, frames = canvas.copy_from_bbox(self.figure.bbox), []
-        for k in samples:
+        still = canvas.copy_from_bbox(self.figure.bbox)
+        for k in intervals:
             canvas.restore_region(still)
-            self.show(k)
-            for artist in self.moving:
+            for artist in self.show(k):
                 self.figure.draw_artist(artist)
             frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
         return frames
