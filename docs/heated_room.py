@@ -1,7 +1,6 @@
 """A heater keeps a room warm during four winter days; two_plants.md beside this file has equations and results."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 
@@ -122,7 +121,7 @@ TWINNING = rt.TwinningConfig(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@rt.configuration
 class Config(rt.RunConfig):
     """Heat a room during four winter days."""
 

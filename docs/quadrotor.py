@@ -1,7 +1,5 @@
 """A quadrotor flies to a point in gusts; two_plants.md beside this file has the equations and results."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 
@@ -112,7 +110,7 @@ TWINNING = rt.TwinningConfig(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@rt.configuration
 class Config(rt.RunConfig):
     """Fly a quadrotor to a point in gusts."""
 

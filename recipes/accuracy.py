@@ -3,7 +3,6 @@
 import copy
 import statistics
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -16,7 +15,7 @@ if __name__ == "__main__":
 import torch
 from torch import nn
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, Trajectory, check_options, load_run, main_of
+from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, Trajectory, configuration, load_run, main_of
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.run_folder import load_tensors
@@ -55,7 +54,7 @@ MEANINGS = {
 """What each comparison with the best law of the form says."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Identify twins in a few real episodes of trainings, and compare them with the true system.
 
@@ -78,7 +77,6 @@ class Config:
     log_dir: Path = Path("runs/accuracy")
 
     def __post_init__(self):
-        check_options(self)
         for argument, least in (("seeds", 1), ("unseen", 2), ("jobs", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")

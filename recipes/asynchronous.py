@@ -1,7 +1,6 @@
 """What it is worth to act while learning: synchronous against asynchronous trainings of the same real time."""
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 
 from rt_torchrl import begin_loading
@@ -12,14 +11,14 @@ if __name__ == "__main__":
 import numpy as np
 from wind_turbine import Config as Turbine
 
-from rt_torchrl import OperationConfig, check_options, main_of, require_finished
+from rt_torchrl import OperationConfig, configuration, main_of, require_finished
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 
 HOUR = 3600.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Compare the costs of synchronous and asynchronous trainings of a wind turbine over the same real time.
 
@@ -47,7 +46,6 @@ class Config:
     log_dir: Path = Path("runs/asynchronous")
 
     def __post_init__(self):
-        check_options(self)
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError(f"seeds={self.seeds} must be at least one, and none negative.")
         if not self.pace > 0.0:

@@ -3,9 +3,8 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rt_torchrl import begin_loading
 
@@ -14,15 +13,17 @@ if __name__ == "__main__":
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from rt_torchrl import DigitalTwin, Estimate, Estimation, EstimationConfig, SensorRecord, check_options, main_of
+from rt_torchrl import DigitalTwin, Estimate, Estimation, EstimationConfig, SensorRecord, configuration, main_of
 from rt_torchrl.atomic_file import write_results
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
 from rt_torchrl.fit.likelihood import Likelihood
 from rt_torchrl.fit.sensors import sensors_of
+from rt_torchrl.options import AtLeastOne, NotNegative
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +36,7 @@ UPPER_LEVEL = 20.0
 """First guess of the upper level, which has no sensor [V]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Identify the Cascaded Tanks benchmark: physics, and physics with a perceptron.
 
@@ -51,15 +52,15 @@ class Config:
     """
 
     data: Path | None = None
-    folds: int = 4
-    priors: tuple[float, ...] = (100.0, 300.0, 1000.0, 3000.0)
-    starts: int = 6
-    iterations: int = 40
+    folds: Annotated[int, Field(ge=2, le=10)] = 4
+    priors: Annotated[tuple[NotNegative, ...], Field(min_length=1)] = (100.0, 300.0, 1000.0, 3000.0)
+    starts: AtLeastOne = 6
+    iterations: AtLeastOne = 40
     test: bool = False
     log_dir: Path = Path("runs/cascaded_tanks")
 
     def __post_init__(self):
-        check_options(self)
+        configuration(self)
         if not 2 <= self.folds <= 10:
             raise ValueError(f"folds={self.folds} of the estimation record must be 2 to 10.")
         if not self.priors:

@@ -1,6 +1,5 @@
 """Finished runs side by side: a table with intervals, and one figure over the real episodes."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,10 +10,10 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import configuration, main_of
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Compare finished runs of one plant. Runs that differ in nothing but the seed are one row.
 
@@ -29,7 +28,6 @@ class Config:
     title: str = "Cost of the live policy while training"
 
     def __post_init__(self):
-        check_options(self)
         if not self.runs:
             raise ValueError("runs names no run; give the folders of finished runs.")
 

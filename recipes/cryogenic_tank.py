@@ -2,11 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rt_torchrl import begin_loading
+from rt_torchrl import begin_loading, configuration
 
 if __name__ == "__main__":
     begin_loading()
@@ -35,6 +35,7 @@ from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.controllers import NarrowOnOff, OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
+from rt_torchrl.options import Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,7 +95,7 @@ VALVES = {"on-off": OnOffValve, "PI": PIValve}
 """Classical controllers that the policies are compared with."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
@@ -122,7 +123,7 @@ class Config(RunConfig):
 
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
-    start: str = "controller"
+    start: Text = "controller"
     observe: tuple[str, ...] = ()
     command: Literal["duty", "drop"] = "duty"
     vented_weight: float = 5000.0

@@ -1,7 +1,6 @@
 """Export from a run folder: a trained policy, the controller around it, or the twin."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from tyro.conf import Positional
 from rt_torchrl import (
     LoadedRun,
     StateFeedback,
-    check_options,
+    configuration,
     export_c,
     export_controller,
     export_onnx,
@@ -25,6 +24,7 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.export.onnx_model import require_packages
+from rt_torchrl.options import Text
 from rt_torchrl.runs.settings import read_settings
 
 FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c",), "twin": ("c",)}
@@ -33,7 +33,7 @@ DEFAULT = ("c", "pt2")
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Export a trained policy; every file is compared with what it is made of before it is written.
 
@@ -58,10 +58,9 @@ class Config:
     formats: tuple[str, ...] | None = None
     output: Path | None = None
     name: str | None = None
-    recipe: str | None = None
+    recipe: Text | None = None
 
     def __post_init__(self):
-        check_options(self)
         formats = DEFAULT if self.formats is None else self.formats
         for option, given, known in (("what", self.what, FORMATS), ("formats", formats, WRITERS)):
             if not given or not set(given) <= set(known):

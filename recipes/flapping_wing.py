@@ -1,11 +1,13 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rt_torchrl import begin_loading
+from pydantic import Field
+
+from rt_torchrl import begin_loading, configuration
 
 if __name__ == "__main__":
     begin_loading()
@@ -32,6 +34,7 @@ from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
+from rt_torchrl.options import Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -114,7 +117,7 @@ STORM = 120.0
 """Wind speed above all that has been measured near the ground [m/s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
@@ -140,13 +143,13 @@ class Config(RunConfig):
 
     policy: Literal["mlp", "paper"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
-    start: str = "controller"
+    start: Text = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     task: Literal["paper", "hop"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0
-    mean_wind: float = 1.0
-    wind_deviation: float = 1.0
+    mean_wind: Annotated[float, Field(ge=-STORM, le=STORM)] = 1.0
+    wind_deviation: Annotated[float, Field(ge=0, le=STORM)] = 1.0
     observe: tuple[str, ...] = ()
     peak: Literal["unit", "printed"] = "unit"
     energy: float = 0.0
@@ -159,16 +162,12 @@ class Config(RunConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if abs(self.mean_wind) > STORM:
-            raise ValueError(f"mean_wind={self.mean_wind} m/s must lie within ±{STORM:g} m/s.")
         FlappingWing.chosen(self.observe)
         self.cost()
         require_unknown(self.unknown)
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         require_rate(self.stroke_plane_rate)
-        if not 0.0 <= self.wind_deviation <= STORM:
-            raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
 
     def presets(self) -> dict[Preset, dict[str, Any]]:
         return super().presets() | {

@@ -1,7 +1,6 @@
 """Draw the pictures of the documentation's gallery: train each plant, and copy its figures under their names."""
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 from rt_torchrl import begin_loading
@@ -9,7 +8,7 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import configuration, main_of
 
 PICTURES = {
     "wind_turbine": (
@@ -23,7 +22,7 @@ PICTURES = {
 """Files of each plant that the gallery shows, by the name of its recipe."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Draw every picture of docs/gallery.md.
 
@@ -40,7 +39,6 @@ class Config:
     log_dir: Path = Path("runs/gallery")
 
     def __post_init__(self):
-        check_options(self)
         unknown = sorted(set(self.plants) - set(PICTURES))
         if unknown or not self.plants:
             raise ValueError(f"plants={self.plants} must be some of {', '.join(PICTURES)}.")

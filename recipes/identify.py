@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ if __name__ == "__main__":
 import torch
 import tyro
 
-from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, check_options, main_of, read_log
+from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, configuration, main_of, read_log
 from rt_torchrl.atomic_file import new_folder, write_results
 from rt_torchrl.fit.least_squares import Identified, identify
 from rt_torchrl.fit.log import Column, checked
@@ -29,12 +29,13 @@ from rt_torchrl.fit.resampling import (
     sensors_in,
 )
 from rt_torchrl.fit.sensors import with_biases
+from rt_torchrl.options import Count, Positive
 from rt_torchrl.runs.command_line import plant_class
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_folder import save_tensors
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Train a plant's twin on a recorded log, without control.
 
@@ -68,22 +69,17 @@ class Config:
     sensors: tuple[str, ...] = ()
     biased: tuple[str, ...] = ()
     guess: tuple[str, ...] = ()
-    dt: float | None = None
-    gap: float | None = None
+    dt: Positive | None = None
+    gap: Positive | None = None
     shortest: int = 10
     held_out: float = 0.25
-    seed: int = 0
+    seed: Count = 0
     log_dir: Path | None = None
     estimation: EstimationConfig = field(default_factory=lambda: EstimationConfig(errors="robust"))
 
     def __post_init__(self):
-        check_options(self)
         if (self.plant is None) == (self.recipe is None):
             raise ValueError("the physics is not known: give one of --plant and --recipe.")
-        if self.dt is not None and not self.dt > 0.0:
-            raise ValueError(f"dt={self.dt} s must be positive.")
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed} must not be negative.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder of its own for the results.")
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,7 +21,7 @@ from rt_torchrl import (
     Plant,
     PredictiveConfig,
     RunConfig,
-    check_options,
+    configuration,
     load_run,
     main_of,
 )
@@ -57,7 +57,7 @@ SOLVE = ("horizon", "iterations", "tolerance")
 """Parameters of model predictive control that may differ from the recipe's."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Compute the limit of a plant's cost, and compare classical controllers and model predictive control with it.
 
@@ -95,7 +95,6 @@ class Config:
     descent: BoundedDescentConfig = field(default_factory=lambda: TO_THE_END)
 
     def __post_init__(self):
-        check_options(self)
         for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0), *((f"mpc_{name}", 0) for name in SOLVE)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")

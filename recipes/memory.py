@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,7 +13,7 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from rt_torchrl import check_options, main_of, require_finished
+from rt_torchrl import configuration, main_of, require_finished
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -30,7 +29,7 @@ OPTIONS = ("--twinning.arm", "model_based", "--untrained", "0", "--unseen", "2",
 RECORDED = ("--twinning.assimilation.inputs", "record", "--twinning.hypotheses.which", "none")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Compare memories of the turbine's twin: the last real episode, and the last four.
 
@@ -52,7 +51,6 @@ class Config:
     log_dir: Path = Path("runs/memory")
 
     def __post_init__(self):
-        check_options(self)
         for argument, least in (("seeds", 1), ("episodes", 1), ("unseen", 2)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")

@@ -1,7 +1,6 @@
 """The figures of the paper's section 6 that have described axes or printed numbers, from trainings by its algorithm."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rt_torchrl import LoadedRun, check_options, load_run, main_of
+from rt_torchrl import LoadedRun, configuration, load_run, main_of
 from rt_torchrl.figures.style import ROLES, TWIN, array, caption, legend_below, panels, role_name
 from rt_torchrl.steps.config import ROLES as POLICIES
 from rt_torchrl.study.sweep import seeded_runs, train_all
@@ -43,7 +42,7 @@ START, HOURS = 540e3, 45.0
 """Pressure that the paper's tank is vented from [Pa], and the time that it takes [h]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Train what is missing by ``--preset paper``, and draw the paper's figures beside its printed numbers.
 
@@ -60,7 +59,6 @@ class Config:
     log_dir: Path = Path("runs/paper")
 
     def __post_init__(self):
-        check_options(self)
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError(f"seeds={self.seeds} must name seeds, which are not negative.")
 

@@ -1,6 +1,6 @@
 """What one quantity costs another: the Pareto front of a plant over one weight of its cost, as table and figure."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +9,7 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-from rt_torchrl import ClassicalController, check_options, main_of
+from rt_torchrl import ClassicalController, configuration, main_of
 from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -17,7 +17,7 @@ from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.study.pareto import Effort, Point, classical_point, keep, pareto_front
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Front:
     """What is weighed against what on a plant.
 
@@ -66,7 +66,7 @@ FRONTS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Find the optima of a plant's policy along one weight of its cost, on the true plant, and judge them on unseen
     episodes.
@@ -81,9 +81,6 @@ class Config:
     plant: Literal["wind_turbine", "flapping_wing", "cryogenic_tank"] = "wind_turbine"
     values: tuple[float, ...] = ()
     log_dir: Path = field(default=Path("runs/pareto"))
-
-    def __post_init__(self):
-        check_options(self)
 
 
 def main(config: Config) -> None:

@@ -1,7 +1,6 @@
 """What some sensors are enough for: plans on twins that were fitted to them, beside plans from the whole state."""
 
 import statistics
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +9,7 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import configuration, main_of
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
@@ -30,7 +29,7 @@ SEEN = {"wind_turbine": (), "flapping_wing": ("--observe", "position+wind"), "cr
 """Options with which the policies observe nothing but these sensors and what a controller computes from them."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Compare plans from some sensors with plans from the whole state, on the same unseen episodes.
 
@@ -55,7 +54,6 @@ class Config:
     log_dir: Path = Path("runs/partial")
 
     def __post_init__(self):
-        check_options(self)
         for argument, least in (("seeds", 1), ("episodes", 1), ("unseen", 2), ("jobs", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")

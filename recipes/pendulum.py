@@ -1,11 +1,11 @@
 """Reinforcement twinning of Gymnasium's pendulum, a real system that is not this library's own."""
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from typing import Any, Literal
 
-from rt_torchrl import begin_loading
+from rt_torchrl import begin_loading, configuration
 
 if __name__ == "__main__":
     begin_loading()
@@ -34,7 +34,7 @@ SWING_UP = TwinningConfig(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """Train twin and controllers on Gymnasium's Pendulum-v1.
 

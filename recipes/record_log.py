@@ -1,7 +1,6 @@
 """Write the log of a simulated real system for ``identify.py``, with jittered intervals, noisy sensors and a gap."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +15,7 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from rt_torchrl import ClassicalController, Plant, check_options, main_of, rk4_step
+from rt_torchrl import ClassicalController, Plant, configuration, main_of, rk4_step
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
@@ -34,7 +33,7 @@ Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 """A control law: a function from time [s], state and exogenous input to a command. It may have a memory."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Fly one episode of a plant and write the log that a data logger would write.
 
@@ -59,7 +58,6 @@ class Config:
     gap: float = 0.02
 
     def __post_init__(self):
-        check_options(self)
         if not 0.0 <= self.gap < 0.5:
             raise ValueError(f"gap={self.gap} must lie in [0, 0.5), a share of the log.")
         known = [state.name for state in logged_states(plant_class(self.plant))]

@@ -2,22 +2,24 @@
 
 import contextlib
 import time
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from rt_torchrl import begin_loading
 
 if __name__ == "__main__":
     begin_loading()
 
+from pydantic import Field
 from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures
 
-from rt_torchrl import OperationConfig, main_of
+from rt_torchrl import OperationConfig, configuration, main_of
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.options import File, Positive
 
 SAFE = (2e4, 20.0)
 """Torque [N m] and pitch [deg] that slow the rotor down in any wind, and do not stop it."""
@@ -28,7 +30,7 @@ def in_operation() -> OperationConfig:
     return OperationConfig(clock="wall", continuous=True)
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(Turbine):
     """Train twin and controllers on a wind turbine at the other end of a protocol, while it operates.
 
@@ -52,20 +54,16 @@ class Config(Turbine):
     asynchronous: bool = True
     operation: OperationConfig = field(default_factory=in_operation)
     protocol: Literal["opcua", "modbus"] = "modbus"
-    port: int = 5020
+    port: Annotated[int, Field(ge=1, le=65535)] = 5020
     connect: bool = False
     serve: bool = False
-    act: Path | None = None
+    act: File | None = None
     trusted: bool = False
-    pace: float = 25.0
+    pace: Positive = 25.0
     safe: tuple[float, float] = SAFE
 
     def __post_init__(self):
         super().__post_init__()
-        if not self.pace > 0.0:
-            raise ValueError(f"pace={self.pace} must be positive, in seconds of the turbine for each second.")
-        if not 0 < self.port < 65536:
-            raise ValueError(f"port={self.port} must lie in 1 ... 65535.")
         if self.asynchronous and self.operation.clock != "wall":
             raise ValueError("operation.clock must be wall: a served plant keeps its own time and does not wait.")
         if self.real != "simulation":

@@ -1,7 +1,6 @@
 """Trainings of one plant over many seeds, and a search over options with Optuna."""
 
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,10 +11,10 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import configuration, main_of
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Train a plant with several seeds side by side and compare them; with trials, search options for the least cost.
 
@@ -38,7 +37,6 @@ class Config:
     log_dir: Path = Path("runs/sweep")
 
     def __post_init__(self):
-        check_options(self)
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError(f"seeds={self.seeds} must name seeds, which are not negative.")
         if self.jobs < 0 or self.trials < 0:

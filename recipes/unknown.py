@@ -1,7 +1,6 @@
 """How much room there is on real systems that their twin does not know: planned policies against the optimum."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +11,7 @@ if __name__ == "__main__":
 
 import tyro
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import configuration, main_of
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
 from rt_torchrl.study.cases import UNSEEN, names, optimum, options_of
@@ -35,7 +34,7 @@ ALONE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
     """Plan on the fitted twin of a real system that it does not know, and compare with the optimum on the true system.
 
@@ -73,7 +72,6 @@ class Config:
     page: Path | None = None
 
     def __post_init__(self):
-        check_options(self)
         for argument, least in (("seeds", 1), ("episodes", 1), ("starts", 1), ("iterations", 1), ("jobs", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")

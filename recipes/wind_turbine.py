@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rt_torchrl import begin_loading
+from pydantic import Field
+
+from rt_torchrl import begin_loading, configuration
 
 if __name__ == "__main__":
     begin_loading()
@@ -37,6 +39,7 @@ from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindT
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
+from rt_torchrl.options import Share, Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,7 +82,7 @@ OBSERVED = {"paper": "paper", "bias": "paper", "scheduled": "scheduled", "mlp": 
 """What each kind of policy observes by default."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
@@ -109,15 +112,15 @@ class Config(RunConfig):
 
     policy: Literal["mlp", "paper", "bias", "scheduled"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
-    start: str = "controller"
+    start: Text = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
     engineering: EngineeringCost = field(default_factory=EngineeringCost)
     dt: float = 0.5
     horizon: float = 600.0
-    mean_wind: float = 11.0
-    turbulence: float = 0.16
+    mean_wind: Annotated[float, Field(gt=0, le=STORM)] = 11.0
+    turbulence: Share = 0.16
     wind_files: tuple[Path, ...] = ()
     model_error: bool = False
     unknown: tuple[str, ...] = ()
@@ -126,10 +129,6 @@ class Config(RunConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if not 0.0 < self.mean_wind <= STORM:
-            raise ValueError(f"mean_wind={self.mean_wind} m/s must be positive and at most {STORM:g} m/s.")
-        if not 0.0 <= self.turbulence <= 1.0:
-            raise ValueError(f"turbulence={self.turbulence} must lie in [0, 1], such as 0.16 for 16 %.")
         if self.task == "paper" and self.engineering != EngineeringCost():
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)

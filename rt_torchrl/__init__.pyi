@@ -69,7 +69,7 @@ from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Star
 # Trainings from the command line, and their results
 from .interruption import require_finished
 from .loading import begin_loading
-from .options import check_options
+from .options import configuration
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run
 from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
@@ -194,9 +194,9 @@ __all__ = [
     "UnreadInput",
     "WholeEpisodes",
     "begin_loading",
-    "check_options",
     "check_plant",
     "clairvoyant",
+    "configuration",
     "control_cost",
     "export_c",
     "export_controller",

@@ -1,121 +1,153 @@
-"""Checks the options of a configuration against the types that its class declares."""
+"""Classes of options, whose declarations say what is allowed, and checks of arguments."""
 
 import dataclasses
+import functools
+import json
 import math
 import numbers
-import types
 import typing
-from collections.abc import Iterable, Sequence
-from functools import cache
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+import pydantic
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import PydanticCustomError
+from typing_extensions import dataclass_transform
+
+Options = TypeVar("Options")
 
 
-def check_options(config: object, *, infinite: Sequence[str] = ()) -> None:
-    """Refuse options whose values do not fit the types that their configuration declares.
+def _no_nan(value: float) -> float:
+    if math.isnan(value):
+        raise PydanticCustomError("nan", "nan")
+    return value
 
-    A dataclass does not check its types itself. This function checks every field that is declared as a ``Literal``, a
-    number, a truth value, a text, a path or another configuration, or an optional or a tuple of these. It leaves other
-    fields alone. A configuration calls it first in its ``__post_init__``, before the checks of its own ranges, which a
-    nan would pass.
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
+"""A positive number, or infinity for no limit."""
+Unbounded = Annotated[float, Field(allow_inf_nan=True), AfterValidator(_no_nan)]
+"""A number, or infinity in either direction."""
+Widths = Annotated[tuple[AtLeastOne, ...], Field(strict=False)]
+"""Widths of hidden layers."""
+File = Annotated[Path, Field(strict=False)]
+"""A path, for which a text may stand."""
+Text = Annotated[str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)]
+"""A text, for which a path may stand."""
+
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+"""No option beside those that are declared; no text or truth value for a number; finite numbers, if nothing else."""
+MUST = {
+    "greater_than_equal": "be at least {ge}",
+    "greater_than": "be greater than {gt}",
+    "less_than_equal": "be at most {le}",
+    "less_than": "be less than {lt}",
+    "int_type": "be a whole number",
+    "int_from_float": "be a whole number",
+    "float_type": "be a number",
+    "finite_number": "be a finite number",
+    "nan": "be a number or infinite",
+    "bool_type": "be True or False",
+    "string_type": "be a text",
+    "path_type": "be a path",
+    "is_instance_of": "be a {class}",
+    "tuple_type": "be a tuple",
+    "too_long": "have at most {max_length} entries",
+    "too_short": "have at least {min_length} entries",
+    "dataclass_type": "be a {class_name}",
+    "dataclass_exact_type": "be a {class_name}",
+}
+"""What an option must be, by the kind of pydantic's error."""
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field,))
+def configuration(options: type[Options]) -> type[Options]:
+    """Make a frozen dataclass of a class, whose options are checked against what it declares.
+
+    The declarations are those of pydantic: ``Annotated[int, Field(ge=1)]``, or :data:`AtLeastOne` for it. A command
+    line and ``config.json`` are read by the same declarations. What concerns several options is checked in
+    ``__post_init__``, which raises a ``ValueError``. A class that derives from one of options is decorated, too.
 
     Args:
-        config: an instance of a dataclass.
-        infinite: names of the fields that may be infinite; all other numbers are finite.
+        options: class with an annotation for each option.
 
     Raises:
-        ValueError: if a value does not fit; the message names the option, its value, and what is allowed.
+        ValueError: when an instance is made, if an option does not exist, or a value is not allowed; the message names
+            the option, its value, and what is allowed.
     """
-    config_class: type = type(config)
-    for name, kind in _kinds(config_class).items():
-        _check(name, getattr(config, name), kind, finite=name not in infinite)
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)(options)
+    validated = made.__init__
+
+    @functools.wraps(validated)
+    def init(self: Any, /, *args: Any, **given: Any) -> None:
+        try:
+            validated(self, *args, **given)
+        except ValidationError as error:
+            raise ValueError(in_words(error, type(self))) from None
+
+    made.__init__ = init
+    return made
 
 
-def with_paths(config: object) -> None:
-    """Make paths of the texts that stand for paths in a configuration, which may be frozen.
-
-    Args:
-        config: an instance of a dataclass, in its ``__post_init__``.
-    """
-    config_class: type = type(config)
-    for name, kind in _kinds(config_class).items():
-        if isinstance(getattr(config, name), str) and Path in (kind, *typing.get_args(kind)):
-            object.__setattr__(config, name, Path(getattr(config, name)))
-
-
-def require_widths(name: str, widths: Sequence[int]) -> None:
-    """Refuse a hidden layer without units.
-
-    Args:
-        name: name of the option, for the message.
-        widths: widths of the hidden layers.
+def read_options(options: type[Options], values: dict[str, Any]) -> Options:
+    """The options of a class that were read from JSON; an option that is missing there has its default.
 
     Raises:
-        ValueError: if a width is below 1.
+        ValueError: if there is no such option, or a value is not allowed.
     """
-    if any(width < 1 for width in widths):
-        raise ValueError(f"{name}={tuple(widths)} must hold widths of layers, each at least 1.")
+    try:
+        return TypeAdapter(options).validate_json(json.dumps(values))
+    except ValidationError as error:
+        raise ValueError(in_words(error, options)) from None
 
 
-def choices(config_class: type, name: str) -> tuple[Any, ...]:
-    """The values that a field declared as a ``Literal`` can have; none for any other field."""
-    kind = _kinds(config_class)[name]
+def in_words(error: ValidationError, options: type) -> str:
+    """A sentence for each thing that pydantic refuses."""
+    return " ".join(_sentence(entry, options.__name__) for entry in error.errors(include_url=False))
+
+
+def _sentence(entry: Any, owner: str) -> str:
+    kind = entry["type"]
+    context = {key: f"{value:g}" if isinstance(value, float) else value for key, value in entry.get("ctx", {}).items()}
+    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in entry["loc"]).removeprefix(".")
+    if kind == "value_error":  # in words of its own
+        return ": ".join(filter(None, (name, str(context["error"]))))
+    if kind == "unexpected_keyword_argument":
+        return f"{owner} has no option {name}; it is of another version or recipe."
+    if kind == "missing":
+        return f"{name} is missing."
+    shown = f"{name}={entry['input']!r}"
+    if kind == "literal_error":
+        return f"{shown} does not exist; choose {context['expected'].replace(chr(39), '')}."
+    return f"{shown} must {MUST[kind].format(**context)}." if kind in MUST else f"{shown}: {entry['msg']}."
+
+
+def require_checked(options: type) -> None:
+    """Refuse a class of options whose own declarations nobody checks.
+
+    Raises:
+        ValueError: if the class was made a dataclass by ``dataclasses.dataclass``.
+    """
+    if "__dataclass_fields__" in vars(options) and "__pydantic_validator__" not in vars(options):
+        raise ValueError(
+            f"the options of {options.__name__} are not checked; decorate it by @rt_torchrl.configuration."
+        )
+
+
+def choices(options: type, name: str) -> tuple[Any, ...]:
+    """The values that an option declared as a ``Literal`` can have; none for any other option."""
+    kind = typing.get_type_hints(options)[name]
     return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
 
 
-@cache
-def _kinds(config_class: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(config_class)
-    return {field.name: hints[field.name] for field in dataclasses.fields(config_class)}
-
-
-def _check(name: str, value: Any, kind: Any, *, finite: bool) -> None:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        if value not in arguments:
-            raise ValueError(f"{name}={value!r} does not exist; choose {_listed(arguments)}.")
-    elif origin in (typing.Union, types.UnionType):
-        others = [argument for argument in arguments if argument is not type(None)]
-        if len(others) == 1 and (value is not None or len(others) == len(arguments)):
-            _check(name, value, others[0], finite=finite)
-    elif origin in (tuple, Sequence):
-        _check_length(name, value, arguments if origin is tuple else (*arguments, Ellipsis))
-        kinds = arguments if origin is tuple and arguments[-1] is not Ellipsis else arguments[:1] * len(value)
-        for place, (entry, each) in enumerate(zip(value, kinds, strict=False)):
-            _check(f"{name}[{place}]", entry, each, finite=finite)
-    elif kind in (int, float):
-        _check_number(name, value, kind, finite=finite)
-    elif kind in PLAIN and not isinstance(value, (str, Path) if kind is str else kind):
-        raise ValueError(f"{name}={value!r} must be {PLAIN[kind]}.")
-    elif dataclasses.is_dataclass(kind) and not isinstance(value, typing.cast(type, kind)):
-        raise ValueError(f"{name}={value!r} must be a {typing.cast(type, kind).__name__}.")
-
-
-def _check_number(name: str, value: Any, kind: type, *, finite: bool) -> None:
-    if kind is int and not _is(value, numbers.Integral):
-        raise ValueError(f"{name}={value!r} must be a whole number.")
-    if kind is float and not _is(value, numbers.Real):
-        raise ValueError(f"{name}={value!r} must be a number.")
-    if kind is float and (math.isnan(value) or (finite and math.isinf(value))):
-        raise ValueError(f"{name}={value} must be {'a finite number' if finite else 'a number or infinite'}.")
-
-
-PLAIN = {bool: "True or False", str: "a text", Path: "a path"}
-"""Kinds of values that have no range, with the words for them in errors."""
-
-
-def _check_length(name: str, value: Any, arguments: tuple[Any, ...]) -> None:
-    """Refuse what is no tuple, or has another number of entries than its declaration."""
-    if not isinstance(value, (tuple, list)):
-        raise ValueError(f"{name}={value!r} must be a tuple.")
-    if arguments[-1:] != (Ellipsis,) and len(value) != len(arguments):
-        raise ValueError(f"{name}={value!r} must have {len(arguments)} entries.")
-
-
 def require_number(name: str, value: Any, *, whole: bool = False, finite: bool = True) -> None:
-    """Refuse a value that is no number, as :func:`check_options` does for an option.
+    """Refuse a value that is no number; a truth value is none, although Python counts it as one.
 
     Args:
         name: name of the argument, for the message.
@@ -126,7 +158,10 @@ def require_number(name: str, value: Any, *, whole: bool = False, finite: bool =
     Raises:
         ValueError: if the value is something else.
     """
-    _check(name, value, int if whole else float, finite=finite)
+    if not isinstance(value, numbers.Integral if whole else numbers.Real) or isinstance(value, bool):
+        raise ValueError(f"{name}={value!r} must be {'a whole number' if whole else 'a number'}.")
+    if math.isnan(value) or (finite and math.isinf(value)):
+        raise ValueError(f"{name}={value} must be {'a finite number' if finite else 'a number or infinite'}.")
 
 
 OTHER_UNITS = {
@@ -193,13 +228,3 @@ def array_of(name: str, values: Any) -> np.ndarray:
 def quoted(names: Iterable[str]) -> str:
     """Names in quotes, because some contain commas."""
     return ", ".join(repr(name) for name in names)
-
-
-def _is(value: Any, kind: type) -> bool:
-    """Whether a value is a number of that kind; a truth value is none, although Python counts it as one."""
-    return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _listed(values: Sequence[Any]) -> str:
-    *others, last = map(str, values)
-    return f"{', '.join(others)} or {last}" if others else last

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from rt_torchrl.options import check_options
+from rt_torchrl.options import Count, configuration
 from rt_torchrl.systems.environment import AroundSystem, require_interval
 
 CLOCK = "time"
@@ -34,7 +33,7 @@ OF_ACTUATORS: tuple[Kind, ...] = ("stuck_actuator", "slow_actuator")
 OF_SYSTEMS: tuple[Kind, ...] = ("raises", "ends_early")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Injection:
     """A fault that is injected into some intervals of an episode.
 
@@ -58,15 +57,14 @@ class Injection:
 
     kind: Kind
     episode: int | None = None
-    first: int = 0
-    last: int | None = None
+    first: Count = 0
+    last: Count | None = None
     entry: str = "state"
     component: int = 0
     value: float = 0.0
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.first < 0 or (self.last is not None and self.last < self.first):
+        if self.last is not None and self.last < self.first:
             raise ValueError(f"first={self.first} and last={self.last} of the injected fault name no intervals.")
         if self.kind == "slow_actuator" and not 0.0 < self.value < 1.0:
             raise ValueError(f"value={self.value} of a slow actuator must lie in (0, 1), a share of the way.")

@@ -40,9 +40,8 @@ def written(path, main):
     """A recipe with the options that every recipe has, and with this code as its main."""
     path.write_text(
         "import json, os\n"
-        "from dataclasses import dataclass\n"
-        "from rt_torchrl.runs.run_config import RunConfig\n\n"
-        "@dataclass(frozen=True, kw_only=True)\n"
+        "from rt_torchrl import RunConfig, configuration\n\n"
+        "@configuration\n"
         "class Config(RunConfig):\n    pass\n\n"
         f"def main(config):\n    {main}\n"
     )

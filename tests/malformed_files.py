@@ -21,10 +21,11 @@ from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import GREATEST_SPEED, read_wind
 from rt_torchrl.fit.log import SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import INTERVALS_PER_ROW, resample
+from rt_torchrl.options import read_options
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import load_tensors, save_tensors
-from rt_torchrl.runs.settings import BESIDE, as_written, config_of, read_settings
+from rt_torchrl.runs.settings import BESIDE, as_written, read_settings
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -124,7 +125,7 @@ def read_checkpoint(path: Path) -> None:
 
 def read_config(path: Path) -> None:
     settings = read_settings(path.parent)
-    config = config_of(RunConfig, {key: value for key, value in settings.items() if key not in BESIDE})
+    config = read_options(RunConfig, {key: value for key, value in settings.items() if key not in BESIDE})
     assert math.isfinite(config.noise) and config.episodes >= 1
 
 

@@ -1,14 +1,15 @@
 """A recipe of the oracle plant that takes seconds."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 
 from rt_torchrl import Run, RunConfig, TwinningConfig
+from rt_torchrl.options import configuration
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """Options of a training that takes a second.
 

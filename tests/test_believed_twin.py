@@ -13,6 +13,7 @@ from test_hypotheses import Suspecting, ensemble
 from rt_torchrl import Run, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.export.c_compiler import c_array
+from rt_torchrl.options import configuration
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.results import hypothesis_lines, results_table
@@ -24,7 +25,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 LAG = 0.35
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     """A system whose actuator lags, and a twin that suspects lag and dead time."""
 

@@ -11,10 +11,11 @@ from test_algorithm import twinning
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.options import read_options
 from rt_torchrl.runs.real_side import simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import as_written, config_of
+from rt_torchrl.runs.settings import as_written
 from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
@@ -102,7 +103,7 @@ def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
         twinning = dataclasses.replace(SMALL, limits=dataclasses.replace(LIMITS, tolerated=0.9))
         shared = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False}
         config = RunConfig(log_dir=folder, twinning=twinning, **shared, **options)
-        assert config_of(RunConfig, as_written(config) | {"log_dir": None, "resume": False}).twinning == twinning
+        assert read_options(RunConfig, as_written(config) | {"log_dir": None, "resume": False}).twinning == twinning
         return Run(config, LinearQuadratic(horizon=2.0))
 
     whole = run(tmp_path / "whole", episodes=3).train()["episodes"]

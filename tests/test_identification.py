@@ -298,8 +298,8 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tm
         ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
         ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
         ({"dt": 60.0}, "unstable"),
-        ({"dt": 0.0}, "dt=0.0 s must be positive"),
-        ({"seed": -1}, "seed=-1 must not be negative"),
+        ({"dt": 0.0}, "dt=0.0 must be greater than 0"),
+        ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"plant": None}, "give one of --plant and --recipe"),
         ({"recipe": RECIPES / "wind_turbine.py"}, "give one of --plant and --recipe"),
         ({"plant": "gone.py:Room"}, "gone.py does not exist"),
@@ -317,10 +317,9 @@ def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
 
 
 OWN = """
-from dataclasses import dataclass
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl import RunConfig, configuration
 from own_turbine import Own
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     dt: float = 0.5
     horizon: float = 30.0

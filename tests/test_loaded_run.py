@@ -111,15 +111,14 @@ TRAIN = """
 import json, sys
 from pathlib import Path
 import torch
-from dataclasses import dataclass
 from room import Room
-from rt_torchrl import Run, load_run
+from rt_torchrl import Run, configuration, load_run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 print("runs")
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config(RunConfig):
     horizon: float = 3.0
     def plant(self):

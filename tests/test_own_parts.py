@@ -22,6 +22,7 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.contract.check import require_controller
+from rt_torchrl.options import configuration
 from rt_torchrl.runs.run import Run
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
@@ -148,7 +149,7 @@ def test_a_text_stands_for_a_path(unchecked):
         RunConfig(log_dir="")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@configuration
 class AnyPolicy(RunConfig):
     policy: str = "affine"
 

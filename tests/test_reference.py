@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 import re
-from dataclasses import dataclass
 
 import pytest
 import torch
@@ -23,6 +22,7 @@ from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import LimitConfig, exact_optimum, fitting, flown_starts, resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.options import configuration
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -31,7 +31,7 @@ from rt_torchrl.trajectories.rollout import Rollout
 WINDOW = PredictiveConfig(horizon=1.0, forecast="held")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Known(RunConfig):
     """A configuration that says how its limit is computed."""
 

@@ -19,12 +19,13 @@ from small_runs import SMALL, small_run
 from torch import nn
 
 from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.options import read_options
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
-from rt_torchrl.runs.settings import BESIDE, config_of, read_settings, require_same
+from rt_torchrl.runs.settings import BESIDE, read_settings, require_same
 from rt_torchrl.steps.plan import MakePlan
 
 HOLDER = """
@@ -211,7 +212,7 @@ def test_what_ran_is_kept_for_every_start(tmp_path):
     settings = read_settings(tmp_path)
     assert settings["plant"] == "p"
     options = {name: value for name, value in settings.items() if name not in BESIDE}
-    assert config_of(RunConfig, options) == RunConfig(log_dir=tmp_path, quick=True, resume=True)
+    assert read_options(RunConfig, options) == RunConfig(log_dir=tmp_path, quick=True, resume=True)
 
 
 # Files that a run writes: whole or not at all, without code, and with their damage noticed.

@@ -2,7 +2,6 @@ r"""The cryogenic tank as a plant: a wall, a saturated mixture and a thermodynam
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -13,7 +12,8 @@ from rt_torchrl.envs.cryogenic_tank import unknown
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients, CubicVentLaw, NeuralCoefficients
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
-from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
+from rt_torchrl.options import NotNegative, configuration
+from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.sampling import DisturbanceModel, require_stable_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Phase, Signal
@@ -55,7 +55,7 @@ class TankCost(RunningCost, Protocol):
     def terminal(self, plant: "CryogenicTank", state: State) -> Cost: ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class PressureCost:
     r"""The paper's cost α_1 e² + α_2 ṁ_c (paper, eq. cryo_J_a), and the cost T_e e² of the pressure at the end.
 
@@ -75,12 +75,9 @@ class PressureCost:
         ValueError: if a weight is negative or not finite.
     """
 
-    error: float = 1.0
-    vented: float = 5000.0
-    end: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_weights(self)
+    error: NotNegative = 1.0
+    vented: NotNegative = 5000.0
+    end: NotNegative = 0.0
 
     def __call__(self, plant: "CryogenicTank", t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         p, (open_drop, share) = state[..., 2], plant.opening(applied[..., 0])

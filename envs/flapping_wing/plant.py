@@ -2,7 +2,6 @@ r"""The flapping-wing micro air vehicle as a plant: a point mass under two beati
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -14,8 +13,8 @@ from torch import Tensor, nn
 from rt_torchrl.envs.flapping_wing import unknown
 from rt_torchrl.envs.flapping_wing.closures import NeuralPolar, QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
-from rt_torchrl.options import require_range
-from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
+from rt_torchrl.options import NotNegative, configuration, require_range
+from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import DisturbanceModel, between, lag, require_stable_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
@@ -86,7 +85,7 @@ POSITION = ("error_x", "error_z", "filtered_rate_x", "filtered_rate_z")
 PHASE = ("phase_cosine", "phase_sine")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class TrackingCost:
     r"""The paper's cost of the way to the target, and of what the flight takes.
 
@@ -111,13 +110,10 @@ class TrackingCost:
         ValueError: if a weight is negative, or the peak is unknown.
     """
 
-    velocity: float = 1.0
+    velocity: NotNegative = 1.0
     peak: Literal["unit", "printed"] = "unit"
-    energy: float = 0.0
-    rate: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_weights(self)
+    energy: NotNegative = 0.0
+    rate: NotNegative = 0.0
 
     def __call__(self, plant: "FlappingWing", t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         e = plant.target - state[..., :2]

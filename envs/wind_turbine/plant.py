@@ -6,7 +6,6 @@ Development*, NREL/TP-500-38060, 2009, where no other source is named.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +14,8 @@ from rt_torchrl.envs.wind_turbine import unknown
 from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
 from rt_torchrl.envs.wind_turbine.disturbances import CUT_IN_WIND, KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
-from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
+from rt_torchrl.options import NotNegative, configuration
+from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import between, lag, require_stable_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, State, States, Time
@@ -427,7 +427,7 @@ class WindTurbine(Plant):
     suspects, further_suspects = unknown.suspects, unknown.further_suspects
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class PaperCost:
     r"""The cost ½(α_1 e_1² + α_2 e_P²) with e_P = (τ_g ω_g − P̃)/P_N (paper, eq. control_functional_mb).
 
@@ -442,11 +442,8 @@ class PaperCost:
         ValueError: if a weight is negative.
     """
 
-    speed: float = 1.0
-    power: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_weights(self)
+    speed: NotNegative = 1.0
+    power: NotNegative = 1.0
 
     def __call__(self, plant: WindTurbine, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         e1 = plant.speed_error(state[..., 1], state[..., 2])
@@ -455,7 +452,7 @@ class PaperCost:
         return 0.5 * (self.speed * e1**2 + self.power * e_P**2)
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class EngineeringCost:
     r"""What the operator of a turbine pays for: energy that is not made, overspeed, and wear of the actuators.
 
@@ -481,15 +478,12 @@ class EngineeringCost:
         ValueError: if a weight is negative.
     """
 
-    energy: float = 1.0
-    excess: float = 1.0
-    overspeed: float = 1.0
-    overshoot: float = 10.0
-    pitch_rate: float = 0.01
-    torque_rate: float = 0.01
-
-    def __post_init__(self) -> None:
-        require_weights(self)
+    energy: NotNegative = 1.0
+    excess: NotNegative = 1.0
+    overspeed: NotNegative = 1.0
+    overshoot: NotNegative = 10.0
+    pitch_rate: NotNegative = 0.01
+    torque_rate: NotNegative = 0.01
 
     def __call__(self, plant: WindTurbine, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         share = plant.generator_power(state, applied) / (plant.actions[0].high * plant.rated_generator_speed)

@@ -13,7 +13,6 @@ the penalty is therefore zero at an optimum and does not move it.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.options import check_options
+from rt_torchrl.options import AtLeastOne, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Inputs, Starts
 from rt_torchrl.plants.signal import bounds
@@ -236,7 +235,7 @@ class CommandCost:
         return cost.detach().numpy() / self.n, slope.numpy() / self.n
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class BoundedDescentConfig:
     """How commands descend a cost.
 
@@ -252,16 +251,10 @@ class BoundedDescentConfig:
         ValueError: if a number is out of its range.
     """
 
-    iterations: int = 1000
-    tolerance: float = 1e-10
-    gradient: float = 1e-8
-    memory: int = 20
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument, least in (("iterations", 1), ("memory", 1), ("tolerance", 0.0), ("gradient", 0.0)):
-            if not getattr(self, argument) >= least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the descent must be at least {least}.")
+    iterations: AtLeastOne = 1000
+    tolerance: NotNegative = 1e-10
+    gradient: NotNegative = 1e-8
+    memory: AtLeastOne = 20
 
 
 class Minimum(NamedTuple):

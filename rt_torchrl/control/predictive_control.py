@@ -7,7 +7,6 @@ import math
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, TerminalCost, descend
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.options import check_options
+from rt_torchrl.options import AtLeastOne, Limit, NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, State
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -33,7 +32,7 @@ FUTURES = 4
 """Number of pairs of futures of a scattered forecast."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class PredictiveConfig:
     """Parameters of model predictive control.
 
@@ -54,25 +53,14 @@ class PredictiveConfig:
         ValueError: if a number is out of its range.
     """
 
-    horizon: float = 1.0
-    period: float | None = None
-    hold: float | None = None
-    iterations: int = 20
-    tolerance: float = 1e-4
-    deadline: float = math.inf
+    horizon: Positive = 1.0
+    period: Positive | None = None
+    hold: Positive | None = None
+    iterations: AtLeastOne = 20
+    tolerance: NotNegative = 1e-4
+    deadline: Limit = math.inf
     forecast: Literal["held", "decaying", "scattered"] = "decaying"
-    virtual_episodes: int = 3
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("deadline",))
-        for argument in ("horizon", "period", "hold", "deadline"):
-            value = getattr(self, argument)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{argument}={value} s of the receding horizon must be positive.")
-        for argument, least in (("iterations", 1), ("tolerance", 0.0), ("virtual_episodes", 1)):
-            if not getattr(self, argument) >= least:
-                value = getattr(self, argument)
-                raise ValueError(f"{argument}={value} of the receding horizon must be at least {least}.")
+    virtual_episodes: AtLeastOne = 3
 
 
 class SharedCommands:

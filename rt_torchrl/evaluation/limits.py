@@ -19,7 +19,7 @@ from rt_torchrl.control.predictive_control import FUTURES, PredictiveConfig, Rec
 from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_start
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
-from rt_torchrl.options import check_options
+from rt_torchrl.options import AtLeastOne, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Inputs
 from rt_torchrl.plants.signal import bounds
@@ -36,7 +36,7 @@ REST = 0.2
 """Longest part of an episode, as a share of it, in which a start may rest at its end."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class LimitConfig:
     """How the limit of a plant's cost is computed, and model predictive control beside it.
 
@@ -53,16 +53,11 @@ class LimitConfig:
 
     starts: Mapping[str, type[ClassicalController]]
     resting: tuple[str, ...] = ()
-    hold: int = 1
+    hold: AtLeastOne = 1
     window: PredictiveConfig | None = None
     descent: BoundedDescentConfig = field(
         default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-13)
     )
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.hold < 1:
-            raise ValueError(f"hold={self.hold} control intervals of a command must be at least 1.")
 
 
 @dataclass(frozen=True, kw_only=True)

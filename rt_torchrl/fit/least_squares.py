@@ -17,7 +17,6 @@ are then cut into segments with first states of their own (multiple shooting), w
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -28,7 +27,7 @@ from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
-from rt_torchrl.options import check_options
+from rt_torchrl.options import AtLeastOne, Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -180,7 +179,7 @@ def move(closure: nn.Module, generator: torch.Generator) -> None:
             w.add_(far * torch.randn(w.shape, generator=generator, dtype=torch.float64).to(w.device))
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class EstimationConfig:
     """Parameters of an estimation.
 
@@ -198,22 +197,12 @@ class EstimationConfig:
             that it follows as well as the shortest ones.
     """
 
-    iterations: int = 30
-    rounds: int = 10
-    prior: float | None = 0.0
-    starts: int = 1
+    iterations: AtLeastOne = 30
+    rounds: AtLeastOne = 10
+    prior: NotNegative | None = 0.0
+    starts: AtLeastOne = 1
     errors: Errors = "fisher"
-    segment: int | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.segment is not None and self.segment < 0:
-            raise ValueError(f"segment={self.segment} of the estimation must not be negative; 0 takes whole records.")
-        for argument in ("iterations", "rounds", "starts"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the estimation must be at least 1.")
-        if self.prior is not None and not self.prior >= 0.0:
-            raise ValueError(f"prior={self.prior} of the estimation must not be negative; None lets the data choose.")
+    segment: Count | None = None
 
 
 class Estimate(NamedTuple):

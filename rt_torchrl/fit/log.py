@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.fit.sensors import known_sensors
-from rt_torchrl.options import array_of, check_options
+from rt_torchrl.options import Positive, array_of, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -33,7 +33,7 @@ Rows = Float[np.ndarray, " rows"]
 """Values of a column."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class LogConfig:
     """How a log is read.
 
@@ -46,15 +46,10 @@ class LogConfig:
 
     columns: tuple[str, ...] = ()
     drop: bool = False
-    gap: float | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.gap is not None and not self.gap > 0.0:
-            raise ValueError(f"gap={self.gap} s must be positive: the longest time between two rows that is bridged.")
+    gap: Positive | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Column:
     r"""A column of a file, the signal that it holds, and its unit: a name, or value = factor·number + offset.
 
@@ -77,7 +72,6 @@ class Column:
     unit: str | None = None
 
     def __post_init__(self) -> None:
-        check_options(self)
         scaled = (self.factor, self.offset) != (1.0, 0.0)
         if not self.factor or (scaled and self.unit is not None):
             raise ValueError(

@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -11,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.options import check_options
+from rt_torchrl.options import Limit, NotNegative, Positive, configuration
 
 Optimiser = Literal["adam", "lbfgs"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class DescentConfig:
     r"""How weights descend a cost that is deterministic within an episode.
 
@@ -36,17 +35,9 @@ class DescentConfig:
     """
 
     optimiser: Optimiser = "adam"
-    rate: float = 0.1
-    gradient_limit: float = 1.0
-    tolerance: float = 1e-9
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("gradient_limit",))
-        for argument in ("rate", "gradient_limit"):
-            if not getattr(self, argument) > 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
-        if not self.tolerance >= 0.0:
-            raise ValueError(f"tolerance={self.tolerance} of the descent must not be negative.")
+    rate: Positive = 0.1
+    gradient_limit: Limit = 1.0
+    tolerance: NotNegative = 1e-9
 
 
 SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))

@@ -28,7 +28,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from rt_torchrl.options import check_options
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import rk4_step, whole_steps
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Ended, Input, Inputs, Observation, State, States, Time
@@ -453,18 +452,3 @@ class RunningCost(Protocol):
     """A running cost L_a of a plant, of any batch dimensions; it must not be negative."""
 
     def __call__(self, plant: Any, t: Time, state: State, applied: Action, exogenous: Input) -> Cost: ...
-
-
-def require_weights(cost: RunningCost) -> None:
-    """Refuse options of a cost that do not fit their types, and weights that are negative.
-
-    Args:
-        cost: a dataclass whose numbers are its weights.
-
-    Raises:
-        ValueError: if an option is of another type, or a weight is negative or not finite.
-    """
-    check_options(cost)
-    for name, weight in vars(cost).items():
-        if isinstance(weight, int | float) and weight < 0.0:
-            raise ValueError(f"{name}={weight} of {type(cost).__name__} must not be negative.")

@@ -8,6 +8,7 @@ import logging
 import os
 import pkgutil
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,17 +18,22 @@ from typing import Any, TypeVar, cast
 import tyro
 
 import rt_torchrl.envs
+from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import module_of, named
 from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
-from rt_torchrl.trajectories.rollout import DivergenceError
 
 Configuration = TypeVar("Configuration")
 
 
 NOISY = ("torchrl", "torch.utils.cpp_extension")
 """Loggers that report the inner work of a library."""
+
+
+PACKAGE = Path(__file__).resolve().parents[1]
+OURS = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
+"""Folders of the library, its plants and its recipes, in a checkout as in a wheel."""
 
 
 def quieten_libraries() -> None:
@@ -39,14 +45,27 @@ def quieten_libraries() -> None:
 
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
-    """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
+    """Run a recipe's main on its command line.
+
+    An error that this library or one of its recipes raises, or the operating system, is one line, because it says what
+    to mend. Any other one keeps its traceback, such as one inside PyTorch or in a plant of the user's own.
+    """
     quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
     try:
         main(from_command_line(config_class))
-    except (ValueError, OSError, DivergenceError) as error:
-        raise SystemExit(f"error: {error}") from error
+    except Exception as error:
+        if isinstance(error, OSError) or _is_for_users(error):
+            raise SystemExit(f"error: {error}") from error
+        raise
     except KeyboardInterrupt:
         sys.exit(130)  # as shells report Ctrl-C
+
+
+def _is_for_users(error: Exception) -> bool:
+    """Whether the library or a recipe of its own has raised the error by a statement ``raise``."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    ours = any(Path(last.filename).is_relative_to(folder) for folder in OURS)
+    return ours and (last.line or "").startswith("raise ")
 
 
 def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:
@@ -100,7 +119,6 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
     from rt_torchrl.runs.settings import (
         BESIDE,
         as_written,  # here, because --help needs none of it
-        config_of,
     )
 
     try:
@@ -121,7 +139,7 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
         raise ValueError(f"config={path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
     options = {name: value for name, value in found.items() if name not in (*BESIDE, *OF_THE_CALL)}
     try:
-        read = config_of(type(asked), _over(as_written(asked.defaults()), options))
+        read = read_options(type(asked), _over(as_written(asked.defaults()), options))
         return dataclasses.replace(read, config=None, log_dir=None)
     except (ValueError, TypeError) as error:
         raise ValueError(f"config={path}: {error}") from error

@@ -14,11 +14,12 @@ from torch import Tensor, nn
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
 from rt_torchrl.runs.run_folder import load_tensors
-from rt_torchrl.runs.settings import BESIDE, class_of, config_of, named, read_settings, require_config
+from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
@@ -287,7 +288,7 @@ def _rebuilt(
         )
     options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:
-        config = config_of(config_class, options)
+        config = read_options(config_class, options)
         plant = plant_of(config) if plant is None else plant
     except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error

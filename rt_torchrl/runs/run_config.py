@@ -4,17 +4,28 @@ import copy
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import torch
+from pydantic import Field
 from torch import nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.limits import LimitConfig
 from rt_torchrl.fit.log import LogConfig
-from rt_torchrl.options import check_options, choices, require_widths, with_paths
+from rt_torchrl.options import (
+    AtLeastOne,
+    Count,
+    File,
+    NotNegative,
+    Text,
+    Widths,
+    choices,
+    configuration,
+    require_checked,
+)
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, TwinningConfig
@@ -26,7 +37,7 @@ Callback = Callable[[Sequence[dict[str, Any]]], str | None]
 None to go on."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class EarlyStopping:
     """Ends a training whose live policy has not become better for a while.
 
@@ -41,14 +52,8 @@ class EarlyStopping:
         ValueError: if an argument is out of its range.
     """
 
-    patience: int
-    least_gain: float = 0.01
-
-    def __post_init__(self) -> None:
-        if self.patience < 1:
-            raise ValueError(f"patience={self.patience} must be at least 1 episode.")
-        if not 0.0 <= self.least_gain < 1.0:
-            raise ValueError(f"least_gain={self.least_gain} must lie in [0, 1), such as 0.01 for one per cent.")
+    patience: AtLeastOne
+    least_gain: Annotated[float, Field(ge=0, lt=1)] = 0.01
 
     def __call__(self, episodes: Sequence[dict[str, Any]]) -> str | None:
         """Why the training should end, by the entries of its episodes; None to go on."""
@@ -96,7 +101,7 @@ GREATEST_SEED = 2**63 - 2
 """Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class RunConfig:
     """The options that every recipe has.
 
@@ -168,74 +173,47 @@ class RunConfig:
 
     preset: Preset = "default"
     policy: Literal["plant", "mlp"] = "plant"
-    hidden: tuple[int, ...] = (32, 32)
+    hidden: Widths = (32, 32)
     model_free_policy: str = "same"
     closure: Literal["plant", "mlp"] = "plant"
-    closure_hidden: tuple[int, ...] = (16, 16)
-    episodes: int = 20
-    patience: int = 0
-    seed: int = 0
+    closure_hidden: Widths = (16, 16)
+    episodes: AtLeastOne = 20
+    patience: Count = 0
+    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = 0
     engine: Engine = "native"
     compiled: bool | None = None
     device: str = "cpu"
-    threads: int = 0
-    start: str = "random"
+    threads: Count = 0
+    start: Text = "random"
     log: LogConfig = field(default_factory=LogConfig)
-    config: Path | None = None
-    log_dir: Path | None = None
+    config: File | None = None
+    log_dir: File | None = None
     resume: bool = False
     overwrite: bool = False
-    checkpoints: int = 3
+    checkpoints: AtLeastOne = 3
     quick: bool = False
-    unseen: int = 20
-    real_unseen: int = 0
-    untrained: int = 20
+    unseen: Annotated[int, Field(ge=2)] = 20
+    real_unseen: Count = 0
+    untrained: Count = 20
     reference: bool = False
-    limit_episodes: int = 8
+    limit_episodes: Count = 8
     figures: bool = True
-    figures_every: int = 5
-    unseen_every: int = 0
+    figures_every: Count = 5
+    unseen_every: Count = 0
     loggers: tuple[LoggerName, ...] = ()
-    noise: float = 0.0
+    noise: NotNegative = 0.0
     asynchronous: bool = False
     operation: OperationConfig = field(default_factory=OperationConfig)
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
     def __post_init__(self) -> None:
-        with_paths(self)
-        check_options(self)
+        require_checked(type(self))
         known = choices(type(self), "policy")
         if known and self.model_free_policy not in ("same", *known):
             raise ValueError(
                 f"model_free_policy={self.model_free_policy!r} does not exist; choose same, {' or '.join(known)}."
             )
-        for argument in ("hidden", "closure_hidden"):
-            require_widths(argument, getattr(self, argument))
         require_loggers(self.loggers)
-        self._check_ranges()
-        if not self.asynchronous and self.operation != self.usual_operation():
-            raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
-
-    def _check_ranges(self) -> None:
-        for argument, least in (
-            ("episodes", 1),
-            ("patience", 0),
-            ("seed", 0),
-            ("threads", 0),
-            ("checkpoints", 1),
-            ("unseen", 2),
-            ("real_unseen", 0),
-            ("untrained", 0),
-            ("figures_every", 0),
-            ("limit_episodes", 0),
-            ("unseen_every", 0),
-        ):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
-        if self.seed > GREATEST_SEED:
-            raise ValueError(f"seed={self.seed} must be at most {GREATEST_SEED}.")
-        if self.noise < 0.0:
-            raise ValueError(f"noise={self.noise} must not be negative; it is a share of what the sensors read.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.reference and self.limit_episodes and self.device != "cpu" and self.limit() is not None:
@@ -250,6 +228,8 @@ class RunConfig:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
+        if not self.asynchronous and self.operation != self.usual_operation():
+            raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
 
     @staticmethod
     def usual_operation() -> OperationConfig:

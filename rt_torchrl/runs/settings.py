@@ -11,16 +11,11 @@ import platform
 import shlex
 import sys
 import time
-import typing
-from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
-from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
-from types import GenericAlias, ModuleType
-from typing import Any, Literal
-
-import cattrs
+from types import ModuleType
+from typing import Any
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.run_config import RunConfig
@@ -67,18 +62,6 @@ def read_settings(folder: Path) -> dict[str, Any]:
     if not isinstance(settings, dict) or not isinstance(settings.get("plant"), str):
         raise ValueError(f"{file} is not that of a run: it does not name a plant.")
     return settings
-
-
-def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConfig:
-    """The configuration of options that were read from JSON; an option that is missing there has its default.
-
-    Raises:
-        ValueError: if the class, or the class of a nested configuration, has no such option or refuses its value.
-    """
-    try:
-        return _converter().structure(options, config_class)
-    except cattrs.BaseValidationError as error:
-        raise ValueError("; ".join(cattrs.transform_error(error, "options", _message))) from error
 
 
 def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
@@ -175,47 +158,6 @@ def _lies_in(file: str, folder: Path) -> bool:
 
 def _same(one: str | None, other: str) -> bool:
     return one is not None and Path(one).resolve() == Path(other).resolve()
-
-
-@cache
-def _converter() -> cattrs.Converter:
-    """A strict converter; cattrs alone would turn a string into a number, and anything into a bool."""
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    for kind in (bool, int, float, str):
-        converter.register_structure_hook(kind, _primitive)
-    converter.register_structure_hook(Path, lambda value, _: Path(_primitive(value, str)))
-    # The class says best itself what it refuses.
-    converter.register_structure_hook_func(_of(Literal), lambda value, _: value)
-    converter.register_structure_hook_func(_of(Sequence), _tuple)
-    return converter
-
-
-def _of(origin: Any) -> Callable[[Any], bool]:
-    """Tells whether a type is of this generic one."""
-    return lambda kind: typing.get_origin(kind) is origin
-
-
-def _tuple(value: Any, kind: Any) -> Any:
-    """A sequence of any length."""
-    (entry,) = typing.get_args(kind)
-    wanted: Any = GenericAlias(tuple, (entry, ...))
-    return _converter().structure(value, wanted)
-
-
-def _primitive(value: Any, kind: type) -> Any:
-    if kind is float and type(value) is int:
-        return float(value)
-    if type(value) is not kind:
-        raise ValueError(f"{value!r} is not of type {kind.__name__}.")
-    return value
-
-
-def _message(error: BaseException, kind: type | None) -> str:
-    """An error of cattrs in words, which hands over the expected type, too."""
-    if isinstance(error, cattrs.ForbiddenExtraKeysError):
-        unknown = ", ".join(sorted(error.extra_fields))
-        return f"{error.cl.__name__} has no option {unknown}; it is of another version or recipe."
-    return f"option {error} is missing" if isinstance(error, KeyError) else str(error)
 
 
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")

@@ -1,12 +1,14 @@
 """Hyper-parameters of the six steps."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.options import check_options, require_widths
+from rt_torchrl.options import AtLeastOne, Count, NotNegative, Positive, Unbounded, Widths, configuration
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 
@@ -20,7 +22,7 @@ EXPERIENCE = 100
 LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class LearnerConfig:
     """Parameters of step 2.
 
@@ -48,35 +50,20 @@ class LearnerConfig:
     """
 
     algorithm: LearnerName = "ddpg"
-    critic_iterations: int = 500
-    actor_iterations: int = 1000
-    batch_size: int = 128
-    discount: float = 0.98
-    return_steps: int = 1
-    reward_scale: float = 1.0
-    target_rate: float = 0.01
-    critic_rate: float = 1e-3
-    actor_rate: float = 2e-3
-    critic_hidden: Sequence[int] = field(default=(64, 64))
-    memory_capacity: int = 100_000
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        require_widths("critic_hidden", self.critic_hidden)
-        for argument in ("critic_iterations", "actor_iterations"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        for argument in ("batch_size", "return_steps", "memory_capacity"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
-        if not 0.0 <= self.discount < 1.0:
-            raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
-        for argument in ("reward_scale", "target_rate", "critic_rate", "actor_rate"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+    critic_iterations: Count = 500
+    actor_iterations: Count = 1000
+    batch_size: AtLeastOne = 128
+    discount: Annotated[float, Field(ge=0, lt=1)] = 0.98
+    return_steps: AtLeastOne = 1
+    reward_scale: Positive = 1.0
+    target_rate: Positive = 0.01
+    critic_rate: Positive = 1e-3
+    actor_rate: Positive = 2e-3
+    critic_hidden: Widths = (64, 64)
+    memory_capacity: AtLeastOne = 100_000
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class ExogenousConfig:
     """Parameters of step 3.
 
@@ -92,22 +79,14 @@ class ExogenousConfig:
             that cost most.
     """
 
-    knots: int = 300
-    kernel_width: float = 2.0
-    penalty: float = 10.0
-    tube: float = 0.05
+    knots: Annotated[int, Field(ge=8)] = 300
+    kernel_width: Positive = 2.0
+    penalty: Positive = 10.0
+    tube: Positive = 0.05
     large_scale: LargeScale = "met"
 
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.knots < 8:
-            raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
-        for argument in ("kernel_width", "penalty", "tube"):
-            if not getattr(self, argument) > 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
 
-
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class ConstraintsConfig:
     r"""Bounds on states that plans shall keep.
 
@@ -121,19 +100,16 @@ class ConstraintsConfig:
         ValueError: if a number is out of its range.
     """
 
-    states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    weight: float = 100.0
+    states: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
+    weight: Positive = 100.0
 
     def __post_init__(self) -> None:
-        check_options(self)
         for name, (low, high) in self.states.items():
             if not low < high:
                 raise ValueError(f"constraints.states {name}={low} to {high} must have its least value first.")
-        if not self.weight > 0.0:
-            raise ValueError(f"constraints.weight={self.weight} must be positive.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class PlannerConfig:
     """Parameters of step 5.
 
@@ -158,12 +134,12 @@ class PlannerConfig:
     """
 
     method: Literal["multi_start", "single_start", "short_horizon", "receding_horizon"] = "multi_start"
-    iterations: int = 10
-    realisations: int | None = None
-    starts: int = 32
+    iterations: Count = 10
+    realisations: AtLeastOne | None = None
+    starts: Count = 32
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
-    window: int = 25
+    window: AtLeastOne = 25
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     @property
@@ -172,22 +148,14 @@ class PlannerConfig:
         return self.method in ("multi_start", "single_start")
 
     def __post_init__(self) -> None:
-        check_options(self)
         if self.constraints.states and not self.whole:
             raise ValueError(
                 f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
                 "planner.method as it is, or leave the constraints out."
             )
-        for argument in ("iterations", "starts"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the planning must not be negative.")
-        if self.window < 1:
-            raise ValueError(f"window={self.window} of the planning must be at least 1 control interval.")
-        if self.realisations is not None and self.realisations < 1:
-            raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class RefereeConfig:
     """Parameters of step 6.
 
@@ -203,20 +171,12 @@ class RefereeConfig:
     """
 
     rule: RefereeName = "expected_cost"
-    patience: int = 2
-    clone_patience: int = 3
-    stall: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument in ("patience", "clone_patience"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        if not self.stall > 0:
-            raise ValueError(f"stall={self.stall} must be positive.")
+    patience: Count = 2
+    clone_patience: Count = 3
+    stall: Positive = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class AssimilationConfig:
     """Parameters of step 4.
 
@@ -252,27 +212,18 @@ class AssimilationConfig:
         biased: names of the sensors that may be off by a constant, which is estimated.
     """
 
-    iterations: int = 15
-    stop_below: float = 0.0
+    iterations: Count = 15
+    stop_below: NotNegative = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "adam"
-    starts: int = 1
-    prior: float = 0.0
-    segment: int | None = None
+    starts: AtLeastOne = 1
+    prior: NotNegative = 0.0
+    segment: Count | None = None
     initial: Literal["measured", "estimated"] = "measured"
     sensors: tuple[str, ...] = ()
     biased: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.iterations < 0:
-            raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
-        if not self.stop_below >= 0.0:
-            raise ValueError(f"stop_below={self.stop_below} of the assimilation must not be negative.")
-        if not self.prior >= 0.0:
-            raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
-        if self.segment is not None and self.segment < 0:
-            raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
         if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
@@ -287,14 +238,14 @@ class AssimilationConfig:
             raise ValueError(
                 f"biased={self.biased} of the assimilation belongs to a fit to sensors; give sensors, too."
             )
-        if self.starts < 1 or (self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured")):
+        if self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured"):
             raise ValueError(
-                f"starts={self.starts} of the assimilation must be at least 1, and more than 1 need "
-                f"method='levenberg_marquardt' and initial='measured', not {self.method!r} and {self.initial!r}."
+                f"starts={self.starts} of the assimilation need method='levenberg_marquardt' and initial='measured', "
+                f"not {self.method!r} and {self.initial!r}."
             )
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class HypothesesConfig:
     """Parameters of the hypotheses.
 
@@ -309,18 +260,15 @@ class HypothesesConfig:
         ValueError: if an argument is out of its range.
     """
 
-    which: tuple[str, ...] = ("automatic",)
-    call: float = 0.05
+    which: Annotated[tuple[str, ...], Field(min_length=1)] = ("automatic",)
+    call: NotNegative = 0.05
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if not self.call >= 0.0:
-            raise ValueError(f"call={self.call} of the hypotheses must not be negative.")
-        if not self.which or (len(self.which) > 1 and {"automatic", "none"} & set(self.which)):
+        if len(self.which) > 1 and {"automatic", "none"} & set(self.which):
             raise ValueError(f"which={self.which} of the hypotheses must be automatic, none, or names of suspects.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class TwinningConfig:
     """Hyper-parameters of the algorithm, by step.
 
@@ -343,9 +291,9 @@ class TwinningConfig:
     """
 
     arm: Arm = "twinning"
-    realisations: int = 5
-    records: int = 1
-    virtual_episodes: int = 20
+    realisations: AtLeastOne = 5
+    records: AtLeastOne = 1
+    virtual_episodes: AtLeastOne = 20
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -364,12 +312,6 @@ class TwinningConfig:
     def bounded_states(self) -> dict[str, tuple[float, float]]:
         """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
         return {**self.limits.states, **self.planner.constraints.states}
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument in ("realisations", "records", "virtual_episodes"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
 
 
 PAPER = TwinningConfig(

@@ -2,17 +2,20 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal
+from dataclasses import field
+from typing import Annotated, Literal
 
-from rt_torchrl.options import array_of, check_options
+from pydantic import Field, SkipValidation
 
-Range = tuple[float | Sequence[float], float | Sequence[float]]
-Count = int | Sequence[int]
+from rt_torchrl.options import AtLeastOne, File, Limit, NotNegative, Positive, Share, Unbounded, array_of, configuration
+
+Range = Annotated[tuple[float | Sequence[float], float | Sequence[float]], SkipValidation]
+"""Least and greatest values, which are checked in words of their own."""
+Duration = Annotated[float, Field(ge=0, allow_inf_nan=True)]
+Count = Annotated[int | Sequence[int], SkipValidation]
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class SafetyConfig:
     """Limits of a safety layer on actions and observations.
 
@@ -46,33 +49,23 @@ class SafetyConfig:
         ValueError: if an option is not a number of its type, or is out of its range.
     """
 
-    interval: float
-    low: tuple[float, ...] | None = None
-    high: tuple[float, ...] | None = None
-    rates: tuple[float, ...] | None = None
+    interval: Positive
+    low: tuple[Unbounded, ...] | None = None
+    high: tuple[Unbounded, ...] | None = None
+    rates: tuple[Unbounded, ...] | None = None
     rest: tuple[float, ...] | None = None
     ranges: Mapping[str, Range] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     clock: str | None = None
-    clock_tolerance: float | None = None
+    clock_tolerance: Positive | None = None
     frozen: Mapping[str, Count] = field(default_factory=dict)
-    following: tuple[float, ...] | None = None
-    deadline: float = math.inf
-    hold: float = 0.0
-    patience: float = math.inf
-    log: Path | None = None
+    following: tuple[Unbounded, ...] | None = None
+    deadline: Limit = math.inf
+    hold: Duration = 0.0
+    patience: Duration = math.inf
+    log: File | None = None
 
     def __post_init__(self) -> None:
-        check_options(self, infinite=("low", "high", "rates", "following", "deadline", "hold", "patience"))
-        if not self.interval > 0.0:
-            raise ValueError(f"interval={self.interval} s must be positive: the system's control interval.")
-        if not self.deadline > 0.0:
-            raise ValueError(f"deadline={self.deadline} s must be positive; infinity waits for ever.")
-        for argument, value in (("hold", self.hold), ("patience", self.patience)):
-            if not value >= 0.0:
-                raise ValueError(f"{argument}={value} s must be a number that is not negative; infinity is one.")
-        if self.clock_tolerance is not None and not self.clock_tolerance > 0.0:
-            raise ValueError(f"clock_tolerance={self.clock_tolerance} s must be positive and finite.")
         for argument, ranges in (("range", self.ranges), ("limit", self.limits)):
             for entry, ends in ranges.items():
                 _require_order(f"{argument} of {entry!r}", *ends)
@@ -91,7 +84,7 @@ def _require_order(what: str, least: float | Sequence[float], greatest: float | 
         raise ValueError(f"{what} is {low.tolist()} to {high.tolist()}; low must be below high.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class OperatingLimitsConfig:
     """Operating limits; a safety layer holds those of actions and rates, and its fallback acts beyond those of states.
 
@@ -106,29 +99,23 @@ class OperatingLimitsConfig:
         ValueError: if a number is out of its range.
     """
 
-    states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    actions: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    rates: Mapping[str, float] = field(default_factory=dict)
-    tolerated: float = 0.0
+    states: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
+    actions: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
+    rates: Mapping[str, Limit] = field(default_factory=dict)
+    tolerated: Share = 0.0
 
     def __post_init__(self) -> None:
-        check_options(self)
         for argument in ("states", "actions"):
             for name, (low, high) in getattr(self, argument).items():
                 if not low < high:
                     raise ValueError(f"limits.{argument} {name}={low} to {high} must have its least value first.")
-        for name, rate in self.rates.items():
-            if not rate > 0.0:
-                raise ValueError(f"limits.rates {name}={rate} must be positive.")
-        if not 0.0 <= self.tolerated <= 1.0:
-            raise ValueError(f"limits.tolerated={self.tolerated} must lie in [0, 1], a share of control intervals.")
 
     def __bool__(self) -> bool:
         """Whether there is any limit."""
         return bool(self.states or self.actions or self.rates)
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class OperationConfig:
     """Options of an operation that goes on while the algorithm learns, with ``asynchronous``.
 
@@ -150,16 +137,7 @@ class OperationConfig:
     """
 
     clock: Literal["simulated", "wall"] = "simulated"
-    learning: float = 0.5
-    speed: float = 1.0
-    handover: int = 20
+    learning: NotNegative = 0.5
+    speed: Positive = 1.0
+    handover: AtLeastOne = 20
     continuous: bool = False
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if not self.learning >= 0.0:
-            raise ValueError(f"learning={self.learning} windows must not be negative; 0 learns in no time.")
-        if not self.speed > 0.0:
-            raise ValueError(f"speed={self.speed} must be positive, in seconds of the plant for each second.")
-        if self.handover < 1:
-            raise ValueError(f"handover={self.handover} control intervals must be at least 1.")

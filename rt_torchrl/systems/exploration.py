@@ -1,20 +1,19 @@
 """Exploration of step 1, noise on the command of the live policy; and bumpless handover from one policy to the next."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.options import check_options
+from rt_torchrl.options import Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class ExplorationConfig:
     r"""Parameters of the noise ξ(i)·N(0, Σ_a) in episode i; Σ_a is diagonal, and ξ falls linearly to zero.
 
@@ -34,15 +33,9 @@ class ExplorationConfig:
         ValueError: if an option is not a number of its type, is negative or not finite.
     """
 
-    spread: float = 0.2
-    episodes: int = 5
-    correlation_time: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument in ("spread", "episodes", "correlation_time"):
-            if not getattr(self, argument) >= 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the exploration must not be negative.")
+    spread: NotNegative = 0.2
+    episodes: Count = 5
+    correlation_time: NotNegative = 0.0
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""

@@ -2,10 +2,10 @@
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import field
 from typing import Any, Literal
 
-from rt_torchrl.options import check_options
+from rt_torchrl.options import Count, configuration
 from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
 
 WIDTHS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
@@ -15,8 +15,10 @@ MOST = 120
 REFUSALS = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure"}
 """Exceptions by which a server refuses a request; after the others, such as a busy device, it may take the next one."""
 
+Kind = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 
-@dataclass(frozen=True)
+
+@configuration
 class Register:
     """A number in the registers of a Modbus device.
 
@@ -32,16 +34,15 @@ class Register:
         ValueError: if an option is none of its choices, the address is negative, or the scale is zero.
     """
 
-    address: int
-    kind: Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] = "float64"
+    address: Count = field(kw_only=False)
+    kind: Kind = field(default="float64", kw_only=False)
     scale: float = 1.0
     word_order: Literal["big", "little"] = "big"
     table: Literal["holding", "input"] = "holding"
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.address < 0 or self.scale == 0.0:
-            raise ValueError(f"address={self.address} must be 0 or more, and scale={self.scale} must not be zero.")
+        if self.scale == 0.0:
+            raise ValueError(f"scale={self.scale} of the register at address={self.address} must not be zero.")
 
     @property
     def width(self) -> int:
