@@ -93,7 +93,7 @@ class Thermostat(rt.ClassicalController):
     default_gains = (21.3, 0.3)
     memory_size = 1
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         middle, width = self.gains.unbind()
         room = state[:, :1]
         on = torch.where(room < middle - width, 1.0, torch.where(room > middle + width, 0.0, memory))
@@ -107,7 +107,7 @@ class PI(rt.ClassicalController):
     default_gains = (1500.0, 0.1)
     memory_size = 1
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         proportional, integral = self.gains.unbind()
         error = COMFORT + 0.3 - state[:, :1]
         command = proportional * error + integral * memory

@@ -100,7 +100,7 @@ class LQR(rt.ClassicalController):
         self.register_buffer("gain", torch.tensor(gain))
         self.register_buffer("target", torch.tensor([*TARGET, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         return HOVER - (state - self.target) @ self.gain.T, memory
 
 

@@ -24,6 +24,7 @@ from .systems.machine.connected_plant import ConnectedPlant, Link, LinkLostError
 from .systems.machine.modbus import ModbusLink, Register
 from .systems.machine.opc_ua import OpcUaLink
 from .systems.machine.rehearsal import ServerProcess, served_system
+from .systems.preflight import Wiring, WiringError, check_real_system
 from .systems.real_system import Actuation, Reading, RealSystem
 from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyReport
 from .evaluation.unseen import RealController
@@ -193,8 +194,11 @@ __all__ = [
     "Uncertainty",
     "UnreadInput",
     "WholeEpisodes",
+    "Wiring",
+    "WiringError",
     "begin_loading",
     "check_plant",
+    "check_real_system",
     "clairvoyant",
     "configuration",
     "control_cost",

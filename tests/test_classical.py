@@ -24,8 +24,11 @@ class PD(ClassicalController):
     default_gains = (0.3, 0.3)
     memory_size = 1
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         return -(self.log_gains.exp() * state).sum(-1, keepdim=True), memory + 1.0
+
+
+LOAD = torch.tensor([[130.0]], dtype=torch.float64)
 
 
 def episodes(plant, count=6, size=0.3):
@@ -63,10 +66,32 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
     assert torch.equal(judged.control_costs, control_cost(plant, own))
 
 
+class FeedForward(PD):
+    """A PD law that cancels the measured disturbance, and keeps its sum."""
+
+    def law(self, state, memory, exogenous):
+        command, _ = super().law(state, memory, exogenous)
+        return command - exogenous, memory + exogenous
+
+
+def test_a_law_sees_the_measured_inputs_of_its_interval_in_flights_and_interval_by_interval():
+    """The velocity follows v' = ... + a + z: with the disturbance cancelled, the flight is the one without it."""
+    plant = LinearQuadratic(horizon=3.0)
+    state, exogenous = episodes(plant)
+    cancelled = FeedForward(plant).fly(state, exogenous)
+    still = PD(plant).fly(state, torch.zeros_like(exogenous))
+    torch.testing.assert_close(cancelled.states, still.states, rtol=0, atol=1e-12)
+    controller = FeedForward(plant)
+    controller.begin()
+    commands = [controller.act(0.0, cancelled.states[:, k], exogenous[:, k]) for k in range(plant.n_steps)]
+    torch.testing.assert_close(torch.stack(commands, 1), cancelled.actions, rtol=0, atol=1e-12)
+    torch.testing.assert_close(controller._memory, exogenous.sum(1), rtol=0, atol=1e-12)
+
+
 class Wild(ClassicalController):
     """A law that asks for what is no number."""
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         return torch.nan * state[:, :1], memory
 
 
@@ -127,7 +152,7 @@ def test_the_valve_opens_above_its_band_and_shuts_below_it():
     valve, is_open, found = OnOffValve(CryogenicTank(), (150e3,)), torch.zeros(1, 1).double(), []
     for error in (-2e3, 0.5e3, 1.5e3, 0.5e3, -0.5e3, -1.5e3, 0.5e3):
         state = torch.tensor([[27.0, 42.0, 500e3 + error]], dtype=torch.float64)
-        command, is_open = valve.law(state, is_open)
+        command, is_open = valve.law(state, is_open, LOAD)
         found.append(round(command.item()))
     assert found == [0, 0, 150_000, 150_000, 150_000, 0, 0]
 
@@ -145,7 +170,7 @@ def test_the_integral_of_the_valve_stops_where_the_valve_does():
     valve, memory = PIValve(plant, (1.0, 1e-3)), torch.zeros(1, 1).double()
     high = torch.tensor([[27.0, 42.0, 540e3]], dtype=torch.float64)
     for _ in range(1000):
-        command, memory = valve.law(high, memory)
+        command, memory = valve.law(high, memory, LOAD)
     assert memory.item() == 200e3 and command.item() == pytest.approx(240e3)
-    command, memory = valve.law(high - torch.tensor([0.0, 0.0, 80e3]), memory)
+    command, memory = valve.law(high - torch.tensor([0.0, 0.0, 80e3]), memory, LOAD)
     assert memory.item() == pytest.approx(200e3 - 1e-3 * 40e3 * 30.0)

@@ -124,7 +124,7 @@ class Lagged(ClassicalController):
 
     memory_size = 1
 
-    def law(self, state, memory):
+    def law(self, state, memory, exogenous):
         memory = 0.8 * memory + 0.2 * state[..., 1:]
         return -2.0 * memory, memory
 

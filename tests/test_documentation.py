@@ -248,7 +248,7 @@ def test_the_thermostat_switches_at_its_edges_alone():
     on = torch.zeros(1, 1).double()
     powers = []
     for temperature in room:
-        power, on = thermostat.law(torch.cat([temperature, temperature]).unsqueeze(0), on)
+        power, on = thermostat.law(torch.cat([temperature, temperature]).unsqueeze(0), on, torch.zeros(1, 3).double())
         powers.append(power.item())
     assert powers == [3000.0, 3000.0, 0.0, 0.0]
     day, night = (plant.occupied(torch.tensor(3600.0 * hour)).item() for hour in (12.0, 3.0))

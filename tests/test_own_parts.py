@@ -110,12 +110,28 @@ def law(**own):
 WRONG_LAWS: list[tuple[Any, str]] = [
     (PD(PLANT), "must be a class derived from ClassicalController; give its class, PD"),
     (LinearGain, "must be a class derived from ClassicalController; give a subclass of it"),
-    (law(law=lambda self, state, memory: state[:, :1]), "first: Mine.law returns Tensor; give both"),
-    (law(law=lambda self, state, memory: (state[:, 0], memory)), r"returns a command, shape \(3,\).*A column is state"),
-    (law(law=lambda self, state, memory: (state[:, :1].float(), memory)), r"command, torch.float32 for 3 states"),
-    (law(law=lambda self, state, memory: (state[:, :1] / 0.0, memory)), "command, 3 values that are not finite"),
-    (law(law=lambda self, state, memory: (state[:, :1], state)), r"returns a memory, shape \(3, 2\).*memory_size=1"),
-    (law(memory_size=0, law=lambda self, state, memory: (state[:, :1], memory[:, [0]])), "as memory_size=0 says"),
+    (law(law=lambda self, state, memory, z: state[:, :1]), "first: Mine.law returns Tensor; give both"),
+    (law(law=lambda self, state, memory: (state[:, :1], memory)), r"It is law\(state, memory, exogenous\)"),
+    (
+        law(law=lambda self, state, memory, z: (state[:, 0], memory)),
+        r"returns a command, shape \(3,\).*A column is state",
+    ),
+    (
+        law(law=lambda self, state, memory, z: (state[:, :1].float(), memory)),
+        r"command, torch.float32 for 3 states",
+    ),
+    (
+        law(law=lambda self, state, memory, z: (state[:, :1] / 0.0, memory)),
+        "command, 3 values that are not finite",
+    ),
+    (
+        law(law=lambda self, state, memory, z: (state[:, :1], state)),
+        r"returns a memory, shape \(3, 2\).*memory_size=1",
+    ),
+    (
+        law(memory_size=0, law=lambda self, state, memory, z: (state[:, :1], memory[:, [0]])),
+        "as memory_size=0 says",
+    ),
     (law(first_memory=lambda self, state: state), r"first_memory returns shape \(3, 2\).*memory_size=1"),
     (law(default_gains=()), r"default_gains=\(\) of Mine must be .*K_1 .*, one for each entry of gain_units"),
 ]

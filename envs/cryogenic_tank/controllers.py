@@ -4,7 +4,7 @@ import torch
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.plant import GREATEST_DROP, CryogenicTank
-from rt_torchrl.plants.shapes import Action, Memory, State
+from rt_torchrl.plants.shapes import Action, Input, Memory, State
 
 
 class OnOffValve(ClassicalController):
@@ -21,7 +21,7 @@ class OnOffValve(ClassicalController):
     half_band = 1e3  # h [Pa]
     memory_size = 1
 
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         error = state[..., 2:] - self.plant.set_point
         is_open = torch.where(error > self.half_band, 1.0, torch.where(error < -self.half_band, 0.0, memory))
         return self.plant.action_of(is_open * self.gains[0]), is_open
@@ -45,9 +45,9 @@ class RestingOnOff(OnOffValve):
     default_gains = (GREATEST_DROP, 43.2e3)
     memory_size = 2
 
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         opening, rest = self.gains.unbind()
-        _, was_open = super().law(state, memory[..., :1])
+        _, was_open = super().law(state, memory[..., :1], exogenous)
         t = memory[..., 1:]
         is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
         return self.plant.action_of(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
@@ -70,7 +70,7 @@ class PIValve(ClassicalController):
     default_gains = (77.5, 6.1e-10)
     memory_size = 1
 
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         K_P, K_I = self.gains.unbind()
         error = state[..., 2:] - self.plant.set_point
         # The contribution of the integral to the drop stays within the range of the valve.

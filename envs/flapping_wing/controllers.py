@@ -4,7 +4,7 @@ import torch
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.plants.shapes import Action, Memory, State
+from rt_torchrl.plants.shapes import Action, Input, Memory, State
 
 
 class TrimmedPD(ClassicalController):
@@ -28,7 +28,7 @@ class TrimmedPD(ClassicalController):
     default_gains = (571.0, 397.0, 61.5, 44.0)
     trim = (76.74, -12.50)
 
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         K_Pz, K_Dz, K_Px, K_Dx = self.gains.unbind()
         e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
         v_x, v_z = self.plant.seen_velocity(state).unbind(-1)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.wind_turbine.plant import FAST_FILTER, RATED_GENERATOR_SPEED, WindTurbine
-from rt_torchrl.plants.shapes import Action, Costs, Memory, State
+from rt_torchrl.plants.shapes import Action, Costs, Input, Memory, State
 from rt_torchrl.plants.signal import bounds
 
 
@@ -62,7 +62,7 @@ class JonkmanController(ClassicalController):
         integral = pitch * (1.0 + pitch / self.schedule_pitch) / self.integral_gain
         return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)
 
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         speed, integral = memory.unbind(-1)
         pitch = torch.deg2rad(state[:, 5])
         speed = (1.0 - self.alpha) * self.plant.gear_ratio * state[:, 0] + self.alpha * speed

@@ -180,14 +180,15 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
         raise ValueError(f"{name}, {given}, must be a class derived from ClassicalController; give {instead}.")
     controller, state = law(plant), plant.draw_initial_state(STATES, seeded(0))[:, : len(plant.readings)]
     size, about = controller.memory_size, f"{name}: {law.__name__}"
-    memory = controller.first_memory(state)
+    memory, exogenous = controller.first_memory(state), plant.draw_exogenous(STATES, seeded(0))[:, 0]
     _require(f"{about}.first_memory returns", memory, size, f"memory_size={size}")
     try:
-        found = controller.law(state, memory)
-    except (IndexError, RuntimeError) as error:
+        found = controller.law(state, memory, exogenous)
+    except (IndexError, RuntimeError, TypeError) as error:
         raise ValueError(
-            f"{about}.law fails for states of shape {tuple(state.shape)} and a memory of shape {tuple(memory.shape)}: "
-            f"{first_line(error)}. Its memory has as many columns as memory_size={size} says."
+            f"{about}.law fails for states of shape {tuple(state.shape)}, a memory of shape {tuple(memory.shape)} and "
+            f"inputs of shape {tuple(exogenous.shape)}: {first_line(error)}. It is law(state, memory, exogenous), and "
+            f"its memory has as many columns as memory_size={size} says."
         ) from error
     if not (isinstance(found, tuple) and len(found) == 2):
         raise ValueError(f"{about}.law returns {type(found).__name__}; give both: return command, memory.")

@@ -23,7 +23,7 @@ REMEDY = "Use a smaller dt, or gains that hold the system."
 
 
 class ClassicalController(nn.Module, ABC):
-    r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with a memory m, which a ``policy(observation)`` cannot have.
+    r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k, z_k)` with a memory m, which a ``policy(observation)`` cannot have.
 
     A subclass defines :meth:`law`, and names its gains and the size of its memory if it has any. The controller keeps
     the logarithms of its gains, so that a search changes a gain in proportion and never its sign. It is
@@ -81,17 +81,18 @@ class ClassicalController(nn.Module, ABC):
         return state.new_zeros(len(state), self.memory_size)
 
     @abstractmethod
-    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory.
 
         Args:
             state: states that sensors read.
             memory: memory before the interval; it has no columns if :attr:`memory_size` is zero.
+            exogenous: measured inputs of the interval, such as a set point or a disturbance.
         """
 
-    def respond(self, state: State, memory: Memory) -> tuple[Action, Memory]:
+    def respond(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         """The command within the ranges of the actions, and the new memory."""
-        command, memory = self.law(state, memory)
+        command, memory = self.law(state, memory, exogenous)
         return command.clamp(self.low_action, self.high_action), memory
 
     def begin(self) -> None:
@@ -100,9 +101,9 @@ class ClassicalController(nn.Module, ABC):
 
     @torch.no_grad()
     def act(self, t: float, state: State, exogenous: Input) -> Action:
-        """The command in the measured state, within the ranges of the actions; time and inputs are not used."""
+        """The command in the measured state and inputs, within the ranges of the actions; the time is not used."""
         memory = self.first_memory(state) if self._memory is None else self._memory
-        command, self._memory = self.respond(state, memory)
+        command, self._memory = self.respond(state, memory, exogenous)
         return command
 
     def report(self) -> dict[str, float]:

@@ -150,8 +150,8 @@ def classical(episodes: UnseenEpisodes, kind: type[ClassicalController]) -> Cont
     """A classical controller with its default gains."""
     controller = kind(episodes.physics)
     flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1, : len(episodes.plant.readings)]
-    memory = controller.first_memory(state)
-    return judged(episodes, flown, timed(lambda: controller.law(state, memory)))
+    memory, exogenous = controller.first_memory(state), episodes.exogenous[:1, 0]
+    return judged(episodes, flown, timed(lambda: controller.law(state, memory, exogenous)))
 
 
 def learned(episodes: UnseenEpisodes, policy: nn.Module) -> Contender:

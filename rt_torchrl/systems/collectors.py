@@ -65,12 +65,12 @@ class ExploringInterval(Interval):
 class ExploringController(RememberingInterval, ExploringInterval):
     """The same interval of a controller with a memory m; its state is (s, m)."""
 
-    def answer(self, carry: Tensor, drive_command: Tensor) -> tuple[Tensor, Tensor]:
+    def answer(self, carry: Tensor, drive: Drive) -> tuple[Tensor, Tensor]:
         """The command to the actuators and the new memory, with the noise and the factors of the sensors."""
         n_s = len(self.plant.states)
-        noise, factor = drive_command.split((len(self.plant.actions), n_s), -1)
+        noise, factor = drive.command.split((len(self.plant.actions), n_s), -1)
         seen = torch.cat([carry[..., :n_s] * factor, carry[..., n_s:]], -1)
-        command, memory = super().answer(seen, drive_command)
+        command, memory = super().answer(seen, drive)
         return (command + noise).clamp(self.low, self.high), memory
 
 

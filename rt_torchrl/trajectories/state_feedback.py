@@ -59,13 +59,16 @@ class StateFeedback(Protocol):
 
 @runtime_checkable
 class Remembering(Protocol):
-    """State feedback that is a function of state and memory alone, so that an interval with it can be traced."""
+    """State feedback that is a function of state, memory and inputs alone, so that an interval with it is traced."""
 
     def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
         """Memory at the start of an episode."""
 
     def respond(
-        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
+        self,
+        state: Float[Tensor, "batch n_s"],
+        memory: Float[Tensor, "batch n_m"],
+        exogenous: Float[Tensor, "batch n_z"],
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command, within the ranges of the actions, and the new memory."""
 
@@ -76,21 +79,22 @@ class RememberingInterval(Interval):
     policy: Any
 
     def answer(
-        self, carry: Float[Tensor, "batch n_c"], drive_command: Float[Tensor, "batch n"]
+        self, carry: Float[Tensor, "batch n_c"], drive: Drive
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command and the new memory; a subclass may read the drive's command, of any width."""
         read, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
-        command, memory = self.policy.respond(read, memory)
+        command, memory = self.policy.respond(read, memory, drive.exogenous)
         return command, memory
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:
         """The commands in the states and memories of whole episodes, whose first dimension is the time."""
-        command, _ = self.answer(state.flatten(0, 1), drive.command.flatten(0, 1))
+        rows = drive._replace(command=drive.command.flatten(0, 1), exogenous=drive.exogenous.flatten(0, 1))
+        command, _ = self.answer(state.flatten(0, 1), rows)
         return command.unflatten(0, state.shape[:2])
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """State and memory, (s, m), at the end of the interval."""
-        command, memory = self.answer(state, drive.command)
+        command, memory = self.answer(state, drive)
         return torch.cat([self.end(state[..., : len(self.plant.states)], command, drive), memory], -1)
 
 

@@ -1,0 +1,147 @@
+"""The check of a real system's wiring: fifteen mistakes on three systems, all of them named, and none where none is."""
+
+import math
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from torchrl.envs import EnvBase
+
+from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem, WiringError, check_real_system
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.systems.environment import AroundSystem
+
+PENDULUM, TURBINE, TANK = Pendulum(horizon=5.0), WindTurbine(horizon=60.0), CryogenicTank(horizon=6000.0)
+
+
+class Machine(AroundSystem):
+    """A simulated plant whose commands come late, or do not arrive."""
+
+    def __init__(self, env: EnvBase, late=False, stays=None):
+        super().__init__(device=env.device, batch_size=env.batch_size)
+        self.env, self.late, self.stays, self.before = env, late, stays, None
+        for name in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
+            setattr(self, name, getattr(env, f"full_{name}").clone())
+        del self.observation_spec["applied"]
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.before = None
+        return self.env.reset().exclude("applied")
+
+    def _step(self, tensordict):
+        asked = tensordict["action"]
+        sent = asked if self.before is None or not self.late else self.before
+        self.before = asked
+        if self.stays is not None:
+            sent = torch.where(torch.tensor(self.stays).isnan(), sent, torch.tensor(self.stays).double())
+        return self.env.step(tensordict.exclude("next").set("action", sent))["next"].exclude("applied")
+
+    def state_dict(self, *args, **kwargs):
+        return self.env.state_dict()
+
+    def load_state_dict(self, state, *args, **kwargs):
+        self.env.load_state_dict(state)
+
+
+def wired(plant, *, real=None, noise=0.0, scale=1.0, offset=0.0, order=None, sent=None, **machine):
+    """A real system, whose readings have a scale, an offset and an order, and whose commands a scale and an offset."""
+    env = Machine(PlantEnv(real or plant, seed=1, noise=noise), **machine)
+    order = list(range(len(plant.states))) if order is None else order
+    state = Reading(keys=("state",), of=lambda values: values[..., order], scale=scale, offset=offset)
+    exogenous = Reading(keys=("exogenous",)) if plant.inputs else None
+    actuation = Actuation(scale=sent[0], offset=sent[1]) if sent else None
+    return RealSystem(env, plant, state=state, exogenous=exogenous, actuation=actuation)
+
+
+def only(plant, column, value, other=1.0):
+    return [value if k == column else other for k in range(len(plant.states))]
+
+
+SWAPPED = [1, 0, 2, 3, 4, 5]
+MISTAKES = {
+    "torque has the other sign": (PENDULUM, {"sent": (-1.0, 0.0)}, "action torque has the other sign"),
+    "angle has the other sign": (PENDULUM, {"scale": only(PENDULUM, 0, -1.0)}, "state angle has the other sign"),
+    "angle and speed in the other order": (PENDULUM, {"order": [1, 0]}, "angle and angular_speed are in the other"),
+    "degrees for radians": (
+        PENDULUM,
+        {"scale": only(PENDULUM, 0, 180.0 / math.pi)},
+        "angle is in deg, where",
+    ),
+    "rpm for rad/s": (
+        PENDULUM,
+        {"scale": only(PENDULUM, 1, 30.0 / math.pi)},
+        "angular_speed is in rpm, where",
+    ),
+    "torque one interval late": (PENDULUM, {"late": True}, "an action acts one interval late"),
+    "torque does not arrive": (PENDULUM, {"stays": [0.5]}, "action torque does not arrive"),
+    "speeds in the other order": (TURBINE, {"order": SWAPPED}, "rotor_speed and filtered_generator_speed are in the"),
+    "pitch in radians": (
+        TURBINE,
+        {"scale": only(TURBINE, 5, math.pi / 180.0)},
+        "blade_pitch is in rad, where",
+    ),
+    "pitch from the other end": (TURBINE, {"sent": ([1.0, -1.0], [0.0, 30.0])}, "blade_pitch runs from the other end"),
+    "1 s for 0.5 s": (TURBINE, {"real": WindTurbine(dt=1.0, horizon=60.0)}, "dt is another one, 1 s and not 0.5 s"),
+    "torque does not arrive, turbine": (TURBINE, {"stays": [2e4, math.nan]}, "action generator_torque does not arrive"),
+    "°C for K": (TANK, {"offset": only(TANK, 0, -273.15, 0.0)}, "wall_temperature is in °C, where the plant has K"),
+    "kPa for Pa": (TANK, {"scale": only(TANK, 2, 1e-3)}, "pressure is in kPa, where the plant has Pa"),
+    "valve one interval late": (TANK, {"late": True}, "an action acts one interval late"),
+}
+
+
+QUICK = ("torque has the other sign", "degrees for radians", "torque one interval late", "°C for K")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MISTAKES]
+)
+def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
+    plant, wiring, words = MISTAKES[name]
+    found = check_real_system(wired(plant, **wiring), plant)
+    assert not found.sound and words in found.mistakes[0].mistake and len(found.mistakes) <= 2
+    with pytest.raises(WiringError, match="the real system does not fit its plant") as raised:
+        found.require()
+    assert words in str(raised.value) and f"{plant.states[0].name}: moves by" in str(raised.value)
+
+
+RIGHT = [(PENDULUM, 0.0), (PENDULUM, 0.01), (TURBINE, 0.0), (TANK, 0.0)]
+RIGHT += [pytest.param(plant, 0.01, marks=pytest.mark.slow) for plant in (TURBINE, TANK)]
+
+
+@pytest.mark.parametrize(("plant", "noise"), RIGHT, ids=lambda value: str(getattr(value, "name", value)))
+def test_no_mistake_is_invented_on_the_right_wiring(plant, noise):
+    """The closure is a first guess, and the sensors are off by 1 %, which is more than a state of the tank moves."""
+    found = check_real_system(wired(plant, noise=noise), plant, plant.make_closure(torch.Generator().manual_seed(3)))
+    found.require()
+    if not noise:
+        assert (found.present.unexplained[found.moved > 0.0] < 2e-3).all()
+
+
+class Draughty(LinearQuadratic):
+    """The oracle plant with a force that its twin does not know: an ordinary model error."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rate = super().vector_field(t, state, action, exogenous, closure)
+        return torch.stack([rate[..., 0], rate[..., 1] - 0.5 * state[..., 1].abs() * state[..., 1] + 0.3], -1)
+
+
+def test_an_ordinary_model_error_is_no_mistake():
+    plant = LinearQuadratic(horizon=5.0)
+    found = check_real_system(wired(plant, real=Draughty(horizon=5.0)), plant)
+    assert found.present.unexplained.max() > 1e-2
+    found.require()
+
+
+def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():
+    system, other = wired(PENDULUM), wired(PENDULUM)
+    check_real_system(system, PENDULUM)
+    assert torch.equal(system.reset()["state"], other.reset()["state"])
+
+
+def test_the_controller_that_flies_first_may_act():
+    found = check_real_system(wired(TURBINE, order=SWAPPED), TURBINE, policy=JonkmanController(TURBINE))
+    assert "are in the other order" in found.mistakes[0].mistake
+    check_real_system(wired(TURBINE), TURBINE, policy=JonkmanController(TURBINE)).require()
