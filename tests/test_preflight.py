@@ -1,13 +1,16 @@
 """The check of a real system's wiring: fifteen mistakes on three systems, all of them named, and none where none is."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
+from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem, WiringError, check_real_system
+from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem, Run, RunConfig, WiringError, check_real_system
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
@@ -145,3 +148,22 @@ def test_the_controller_that_flies_first_may_act():
     found = check_real_system(wired(TURBINE, order=SWAPPED), TURBINE, policy=JonkmanController(TURBINE))
     assert "are in the other order" in found.mistakes[0].mistake
     check_real_system(wired(TURBINE), TURBINE, policy=JonkmanController(TURBINE)).require()
+
+
+@pytest.mark.parametrize("mended", [False, True])
+def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_learns(tmp_path, mended):
+    system = wired(PENDULUM, sent=None if mended else (-1.0, 0.0))
+    config = RunConfig(
+        log_dir=tmp_path, episodes=1, unseen=2, untrained=0, figures=False, twinning=SMALL, compiled=False
+    )
+    run = Run(config, PENDULUM, env=system)
+    if mended:
+        assert len(run.train()["episodes"]) == 1
+        return
+    before = parameters_to_vector(run.algorithm.twin.closure.parameters())
+    with pytest.raises(WiringError, match="action torque has the other sign"):
+        run.train()
+    assert torch.equal(parameters_to_vector(run.algorithm.twin.closure.parameters()), before)
+    assert not len(run.algorithm.learner.memory) and system.state_dict()["episodes"] == 1
+    unchecked = dataclasses.replace(config, preflight=False, log_dir=tmp_path / "unchecked")
+    assert len(Run(unchecked, PENDULUM, env=system).train()["episodes"]) == 1

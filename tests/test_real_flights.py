@@ -56,7 +56,7 @@ def run_on(
     machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=SMALL, untrained=2, **options
 ):
     own = {"compiled": False, "episodes": 2, "unseen": 3, "figures": False, "untrained": untrained}
-    config = RunConfig(log_dir=folder, twinning=twinning, **own, **options)
+    config = RunConfig(log_dir=folder, twinning=twinning, **own | options)
     plant = machine.inner.plant
     given = {"baselines": baselines, "first": first, "callbacks": callbacks}
     return Run(config, plant, env=connected(plant, rig=machine, closure=closure), **given)
@@ -118,17 +118,51 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     summary, said = metrics["summary"], capsys.readouterr().out
     live = summary["live"]
     words = live.replace("_", "-")
-    assert f"6 flights on the real system: 2 of the live policy ({words}), 2 of PD, 2 of cascade" in said
+    assert f"6 flights on the real system: 2 of the live policy ({words}), 2 of cascade, 2 of PD" in said
     paid = summary["cost_of_learning"]
     assert paid["episodes"] == 9 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)
     costs = summary["real_unseen"]["costs"]
-    assert [*costs] == [live, "PD", "cascade"]
+    assert [*costs] == [live, "cascade", "PD"]
     assert [cost for each in costs.values() for cost in each] == pytest.approx(rig.costs[3:], rel=1e-9)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     policy = run.algorithm.policies[live]
     for observation, applied in rig.flights[3] + rig.flights[4]:
         torch.testing.assert_close(applied, policy(observation).detach(), rtol=1e-9, atol=1e-12)
+
+
+class Tracking(PD):
+    """A PD law that cancels the disturbance that is measured."""
+
+    def law(self, state, memory, exogenous):
+        command, memory = super().law(state, memory, exogenous)
+        return command - exogenous, memory
+
+
+def test_a_classical_controller_is_judged_on_the_episodes_of_the_policies_where_nobody_knows_the_closure(
+    tmp_path, capsys
+):
+    """On the twin as it is at the end, and in the flights that are asked for; both in loops of our own."""
+    rig = machine()
+    run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, baselines={"mine": Tracking}, figures=True)
+    summary = run.train()["summary"]
+    plant, twin = rig.inner.plant, run.algorithm.twin.believed
+    s, costs, law = run.unseen.initial_state, 0.0, Tracking(plant)
+    memory = law.first_memory(s)
+    for k in range(STEPS):
+        t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
+        command, memory = law.respond(s, memory, z)
+        a = plant.actuate(s, command)
+        costs = costs + plant.running_cost(t, s, a, z) / STEPS
+        s = plant.step(t, s, a, z, twin.closure).state
+    costs = costs + plant.terminal_cost(s) / (STEPS * plant.dt)
+    unseen = summary["unseen"]
+    assert [*unseen["baselines"]] == ["mine", "PD"] and unseen["judged_on"] == "twin"
+    assert unseen["baselines"]["mine"]["J_a"]["mean"] == pytest.approx(costs.mean().item(), rel=1e-9)
+    flights = summary["real_unseen"]["costs"]
+    assert [*flights] == [summary["live"], "mine", "PD"] and len(rig.flights) == 1 + 2 + 3 * 2
+    assert flights["mine"] == pytest.approx(rig.costs[5:7], rel=1e-9)
+    assert (tmp_path / "figures" / "flights.png").is_file() and "mine" in capsys.readouterr().out
 
 
 def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_path):

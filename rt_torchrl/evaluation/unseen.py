@@ -51,6 +51,20 @@ Baseline = ClassicalController | RealController
 """A controller that is judged beside the policies: on the plant, or on a real system of which no closure is known."""
 
 
+def require_classical(law: Baseline, plant: Plant) -> ClassicalController:
+    """Refuse a controller that can only be flown on the real system.
+
+    Raises:
+        ValueError: if it is one.
+    """
+    if not isinstance(law, ClassicalController):
+        raise ValueError(
+            f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
+            f"{plant.name!r}."
+        )
+    return law
+
+
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
@@ -133,11 +147,7 @@ class UnseenEpisodes:
         Raises:
             ValueError: if the controller can only be flown on the real system.
         """
-        if not isinstance(law, ClassicalController):
-            raise ValueError(
-                f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
-                f"{self.plant.name!r}."
-            )
+        law = require_classical(law, self.plant)
         return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
 
     @torch.no_grad()
@@ -236,6 +246,14 @@ class TwinEpisodes(UnseenEpisodes):
 
         return flown(self.flying.at_rest(self.initial_state), self.exogenous)
 
+    def fly_baseline(self, law: Baseline) -> Trajectory:
+        """Fly the episodes with a classical controller on the twin.
+
+        Raises:
+            ValueError: if the controller can only be flown on the real system.
+        """
+        return self.fly(require_classical(law, self.plant))
+
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Costs:
         return control_cost(self.flying, self.fly(policy))
@@ -277,17 +295,10 @@ class RealEpisodes(UnseenEpisodes):
         """No validation episodes, because a real episode may take hours."""
 
     def fly_baseline(self, law: Baseline) -> Trajectory:
-        """As many episodes on the real system.
-
-        Raises:
-            ValueError: if the controller is one that is flown on the plant.
-        """
-        if not isinstance(law, RealController):
-            raise ValueError(
-                f"law={type(law).__name__} is flown on the plant under the true closure, which is not known of this "
-                "real system; give a RealController, or the RealSystem its closure."
-            )
-        return law.fly_real(self._count, seed=UNSEEN_SEED)
+        """As many episodes on the real system."""
+        if isinstance(law, RealController):
+            return law.fly_real(self._count, seed=UNSEEN_SEED)
+        return self.fly(law)
 
     @torch.no_grad()
     def _flown(self, policy: nn.Module, count: int) -> Trajectory:

@@ -26,7 +26,7 @@ WIDEST_LINEAR = 30.0
 
 
 @torch.no_grad()
-def flights(plant: Plant, flown: Mapping[str, Trajectory]) -> Figure:
+def flights(plant: Plant, flown: Mapping[str, Trajectory], *, where: str = "") -> Figure:
     """Setpoints and actions of one episode under several controllers, over time.
 
     A plant that states no setpoints shows its states. The setpoints drawn are those of the first controller.
@@ -35,12 +35,13 @@ def flights(plant: Plant, flown: Mapping[str, Trajectory]) -> Figure:
         plant: physics that the states are those of.
         flown: an episode under each controller, by name, with the policy that matters most first; none has a batch
             dimension, and states beyond those of the plant are left out.
+        where: where the episode was flown, if not on the system, such as on the twin.
     """
     shown = {name: _held(plant, one) for name, one in flown.items()}
     labels, intervals = list(next(iter(shown.values()))), max(len(one.actions) for one in flown.values())
     rows = len(labels) + len(plant.actions)
     size = (8.5, 1.0 + 1.75 * rows)
-    figure, axes, time = style.timeline(plant, intervals, rows, title="One unseen episode", size=size)
+    figure, axes, time = style.timeline(plant, intervals, rows, title=f"One unseen episode {where}".strip(), size=size)
     for place, (name, one) in enumerate(flown.items()):
         look: dict[str, Any] = {"color": COLOURS.get(name, OTHERS[place % len(OTHERS)])}
         look |= {"linewidth": 2.0 if place == 0 else 1.1, "label": style.role_name(name) if name in ROLES else name}

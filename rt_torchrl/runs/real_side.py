@@ -17,7 +17,6 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import (
     Baseline,
     Judged,
-    RealController,
     RealEpisodes,
     TwinEpisodes,
     UnseenEpisodes,
@@ -209,23 +208,21 @@ def contenders(
     system: RealSystem,
     algorithm: ReinforcementTwinning,
     untrained: Mapping[Role, nn.Module],
-    first: type[ClassicalController] | None,
     baselines: Mapping[str, Baseline],
     *,
     device: torch.device,
 ) -> dict[str, Contender]:
     """The controllers that are to fly the real system after the training, by name.
 
-    These are the live policy, unless it still has the random weights that it began with; the controller that the
-    training has begun with; and the controllers that nothing but the real system can fly.
+    These are the live policy, unless it still has the random weights that it began with, and the controllers that are
+    judged beside the policies.
 
     Args:
         config: options of the run.
         system: the real system.
         algorithm: the training at its end.
         untrained: the policies before it.
-        first: class of the controller that the real system has had so far.
-        baselines: controllers that are judged beside the policies.
+        baselines: controllers that are judged beside the policies, with the one that the training has begun with.
         device: device of the twin.
     """
     found: dict[str, Contender] = {}
@@ -237,14 +234,7 @@ def contenders(
     known = config.start != "random" or isinstance(policy, StateFeedback)
     if known or not clones(policy, untrained[live]):
         found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
-    if config.start == "controller" and first is not None:
-        controller = first(algorithm.twin.plant).to(device)
-        name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
-        found[name] = Contender(name, partial(asked.fly, controller))
-    for name, law in baselines.items():
-        if isinstance(law, RealController):
-            found[name] = Contender(name, partial(asked.fly_baseline, law))
-    return found
+    return found | {name: Contender(name, partial(asked.fly_baseline, law)) for name, law in baselines.items()}
 
 
 def announcement(found: Mapping[str, Contender], count: int) -> str:

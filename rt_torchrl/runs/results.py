@@ -399,7 +399,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         lines += limit_lines(found["reference"])
     for name, baseline in unseen["baselines"].items():
         lines.append(
-            f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
+            f"  {f'J_a {name}{twin}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
         )
     lines += merit_lines(unseen)
     lines += real_lines(found.get("real_unseen"))

@@ -48,6 +48,7 @@ from rt_torchrl.steps.plan import MakePlanner, make_planner
 from rt_torchrl.steps.start import first_live
 from rt_torchrl.steps.switch import MakeReferee, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
+from rt_torchrl.systems.preflight import check_record
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -105,16 +106,12 @@ class Drawing:
 def first_flights(
     unseen: UnseenEpisodes, live: Role, policy: nn.Module, baselines: Mapping[str, Baseline]
 ) -> dict[str, "Figure"]:
-    """The figure of the first unseen episode under the live policy and the classical controllers.
-
-    It is left out on a real system of unknown closure, where these would be flights of their own.
-    """
-    if unseen.closure is None:
-        return {}
+    """The figure of the first unseen episode under the live policy and the classical controllers."""
     episode = unseen.first(1)
     flown = {str(live): episode.fly(policy)}
     flown |= {name: episode.fly_baseline(law) for name, law in baselines.items()}
-    return {"flights": figures.flights(unseen.physics, {who: one.each()[0] for who, one in flown.items()})}
+    shown, where = {who: one.each()[0] for who, one in flown.items()}, "on the twin" if unseen.closure is None else ""
+    return {"flights": figures.flights(unseen.physics, shown, where=where)}
 
 
 class Run:
@@ -132,10 +129,10 @@ class Run:
         believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
             system; None if it does not.
         plant_figures: function that draws the figures that only this plant has.
-        baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
-            unknown closure and ``config.real_unseen`` flights, a :class:`RealController`.
-        first: class of the controller that the real system has had so far, for ``start="controller"``. It is judged
-            beside the policies wherever the unseen episodes are flown under the true closure.
+        baselines: controllers to judge beside the policies, on the same episodes, by name. On a real system they fly
+            ``config.real_unseen`` episodes, too, and a :class:`RealController` flies these alone.
+        first: class of the controller that the real system has had so far, for ``start="controller"``; it is one of the
+            baselines then.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
         replay: function of ``config.twinning.learner.memory_capacity``, ``correction=`` and ``generator=`` that makes
@@ -193,7 +190,7 @@ class Run:
         physics = known_physics(config, plant, believed, real, first, baselines)
         laws = dict(baselines or {})
         if config.start == "controller" and first is not None and first not in laws.values():
-            laws |= {} if real is not None and real.closure is None else {first.__name__: first}
+            laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
         self._start = start_of(config, physics, first)
         if threads := learner_threads(config):
             torch.set_num_threads(threads)
@@ -206,7 +203,7 @@ class Run:
             makers = (learner or functools.partial(ActorCritic, replay=replay), planner, referee, collector)
             self._make_algorithm(system, make_env, physics, *makers, device=device, compiled=compiled)
             self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
-            self._real, self._first, self._device = real, first, device
+            self._real, self._device = real, device
             made = {name: law(physics, compiled=compiled) for name, law in laws.items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
@@ -214,6 +211,8 @@ class Run:
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
+            elif real is not None and config.preflight:
+                self.algorithm.flights.check = self._require_wiring
         except BaseException:
             self._held.release()
             raise
@@ -257,6 +256,10 @@ class Run:
         )
         # Copies made after the algorithm know its learner's critic, where model predictive control needs one.
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
+
+    def _require_wiring(self, record: Trajectory) -> None:
+        """Refuse a real system whose first flight shows a mistake in its wiring."""
+        check_record(record, self.algorithm.twin.plant, self.initial_closure).require()
 
     def train(self) -> dict[str, Any]:
         """Train, evaluate and write the results.
@@ -392,7 +395,7 @@ class Run:
             return {}
         if len(self.episodes) < self.config.episodes and self.ended is None:
             return {}  # who has pressed Ctrl-C does not want the real system to go on
-        parts = self.initial_policies, self._first, self.baselines
+        parts = self.initial_policies, self.baselines
         found = real_side.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
         live = self.algorithm.referee.live
         if self.config.real_unseen and live not in found:

@@ -149,6 +149,8 @@ class RunConfig:
             here: the live policy, if it was trained, and the controller of start. The run says how many flights of whom
             before the first one, and counts them as paid; after Ctrl-C nothing flies. Baselines that nothing but the
             real system can fly do so as many times, and are refused with 0.
+        preflight: whether the first flight of a real system is compared with one-step predictions of the twin before
+            anything is learned, and wiring that does not fit is refused; see :func:`check_real_system`.
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
@@ -194,6 +196,7 @@ class RunConfig:
     quick: bool = False
     unseen: Annotated[int, Field(ge=2)] = 20
     real_unseen: Count = 0
+    preflight: bool = True
     untrained: Count = 20
     reference: bool = False
     limit_episodes: Count = 8

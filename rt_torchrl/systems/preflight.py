@@ -27,10 +27,13 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 STARTS, INTERVALS = 3, 40
 """Number of starts, and of control intervals after each."""
+ROWS = 200
+"""Greatest number of intervals of a record that are looked at."""
 EXPLAINED = 3e-3
 """Share of the movement of a state that a twin with fitted coefficients may leave unexplained without a question."""
 FLOOR = 3e-4
@@ -146,7 +149,7 @@ class Wiring(NamedTuple):
         if self.mistakes:
             raise WiringError(
                 f"the real system does not fit its plant: {self}\nMend Reading or Actuation (keys, order, scale, "
-                "offset), or the plant; --no-preflight trains all the same."
+                "offset), or the plant. Where all is as it should be, --no-preflight trains without this check."
             )
 
 
@@ -174,7 +177,22 @@ def check_real_system(
     """
     generator = torch.Generator(device=env.device).manual_seed(seed)
     closure = plant.make_closure(generator) if closure is None else closure
-    flown = _fly(env, plant, _Middle(plant) if policy is None else policy, spread, generator)
+    return _checked(_fly(env, plant, _Middle(plant) if policy is None else policy, spread, generator), plant, closure)
+
+
+def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
+    """The same of a flight that has been flown, such as the first one of a training."""
+    n = len(record.actions)
+    rows = torch.linspace(0, n - 1, min(n, ROWS)).long()
+    before = (rows - 1).clamp(min=0)
+    t = float(record.start) + plant.dt * rows.double()
+    states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
+    earlier = actions[before], exogenous[before]
+    return _checked(Flown(t, states[rows], actions[rows], exogenous[rows], states[rows + 1], earlier), plant, closure)
+
+
+def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
+    plant = copy.deepcopy(plant).cpu()
     fit = _Fit(plant, closure)
     present, mistakes = fit.suspicion("", flown), list[Suspicion]()
     if (present.unexplained > EXPLAINED).any():
