@@ -16,6 +16,7 @@ from torch.nn.utils import parameters_to_vector
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes
 from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
@@ -97,6 +98,11 @@ def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
         s = plant.step(t, s, a, z, twin.closure).state
     costs = costs + plant.terminal_cost(s) / (STEPS * plant.dt)
     assert unseen["costs"]["model_based"] == pytest.approx(costs.tolist(), rel=1e-9)
+    # What nobody knows is not simulated as if it were the guess of the data sheet.
+    finished = load_run(tmp_path, plant=plant)
+    with pytest.raises(ValueError, match="nobody knows the true closure of this run's real system"):
+        finished.simulate(finished.policy("model_based"))
+    assert finished.simulate(finished.policy("model_based"), on="twin").states.isfinite().all()
 
 
 class Asked(RealController):

@@ -17,6 +17,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
+from rt_torchrl.runs.results import on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
@@ -116,11 +117,17 @@ class LoadedRun:
             seed: seed of what is drawn.
 
         Raises:
-            ValueError: if ``on`` is something else, or shapes do not fit the plant.
+            ValueError: if ``on`` is something else, it is real and nobody knows the true closure, or shapes do not fit
+                the plant.
             DivergenceError: if the system diverges.
         """
         if on not in ("real", "twin"):
             raise ValueError(f"on={on!r} must be real or twin.")
+        if on == "real" and on_the_twin(self.metrics["summary"]["unseen"]):
+            raise ValueError(
+                "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
+                "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
+            )
         if not isinstance(policy, nn.Module | StateFeedback):
             raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
         believed = self.twin.believed

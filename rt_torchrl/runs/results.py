@@ -398,9 +398,8 @@ def results_table(metrics: dict[str, Any]) -> str:
         lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
         lines += limit_lines(found["reference"])
     for name, baseline in unseen["baselines"].items():
-        lines.append(
-            f"  {f'J_a {name}{twin}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
-        )
+        mean = _number(baseline["J_a"]["mean"], ".5g")
+        lines.append(f"  {f'J_a {name}{twin}':<22}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
     lines += merit_lines(unseen)
     lines += real_lines(found.get("real_unseen"))
     paid = found["cost_of_learning"]

@@ -173,6 +173,8 @@ class RealFlights:
         """Faults of the system in the episodes since :meth:`begin`."""
         self.latest: Flight | None = None
         """The flight that was flown last."""
+        self.check: Callable[[Trajectory], None] | None = None
+        """What looks at the record of the first flight, before anything is learned from it, and may raise."""
 
     def begin(self) -> None:
         """Begin an episode of the algorithm."""
@@ -209,6 +211,9 @@ class RealFlights:
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if found.whole else (0, 0.0)
         self.latest = Flight(transitions, record, refused, faults, others, found.whole, after)
+        if self.check is not None:
+            check, self.check = self.check, None
+            check(record)
         return self.latest
 
     def fly_first(self, policy: nn.Module) -> Flight:
