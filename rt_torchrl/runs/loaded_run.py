@@ -123,7 +123,7 @@ class LoadedRun:
         """
         if on not in ("real", "twin"):
             raise ValueError(f"on={on!r} must be real or twin.")
-        if on == "real" and on_the_twin(self.metrics["summary"]["unseen"]):
+        if on == "real" and on_the_twin(self.metrics["summary"].get("unseen", {})):
             raise ValueError(
                 "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
                 "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
