@@ -59,15 +59,6 @@ class Config:
     test: bool = False
     log_dir: Path = Path("runs/cascaded_tanks")
 
-    def __post_init__(self):
-        configuration(self)
-        if not 2 <= self.folds <= 10:
-            raise ValueError(f"folds={self.folds} of the estimation record must be 2 to 10.")
-        if not self.priors:
-            raise ValueError("priors=() must hold one stiffness at least.")
-        for prior in self.priors:
-            EstimationConfig(iterations=self.iterations, starts=self.starts, prior=prior)
-
     def estimation(self, closure: nn.Module, **options: Any) -> Estimation:
         """The estimation of a closure of the tanks from the lower level."""
         plant, config = CascadedTanks(), EstimationConfig(iterations=self.iterations, errors="robust", **options)
