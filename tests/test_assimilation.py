@@ -156,7 +156,7 @@ def test_segments_start_at_their_own_time_and_state():
             )
             expected.append(identification_cost(plant, flown, piece).item())
     segments = replayed(*records).segments(12, plant.dt)
-    found = of_segments(plant, closure).normal_equations(segments).cost.item()
+    found = of_segments(plant, closure).likelihood(segments).normal_equations().cost.item()
     assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
 
 

@@ -117,7 +117,7 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
         assimilation.update([flown.each()[0]], [], 1, seeded())
         away = parameters_to_vector(twin.closure.correction.parameters()).detach() - start
         moved.append(away.norm().item())
-        found = assimilation.normal_equations(flown)
+        found = assimilation.likelihood(flown).normal_equations()
         # At the minimum of both the gradient of J_p is the pull of the prior; the steps end where 1e-4 of the cost is
         # left to gain, some hundredths of the gradient.
         assert (found.gradient + prior * away).norm() <= 0.1 * found.gradient.norm()

@@ -131,7 +131,7 @@ def recorded(plant, batch=3, seed=0):
 def test_gradient_and_states_are_those_of_backpropagation(plant, piece, monkeypatch):
     monkeypatch.setattr(parallel, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
     twin, flown, exogenous = recorded(plant)
-    found = Assimilation(twin, AssimilationConfig()).normal_equations(flown)
+    found = Assimilation(twin, AssimilationConfig()).likelihood(flown).normal_equations()
     rollout = Rollout(plant, twin.closure, engine="autograd")
     cost = identification_cost(plant, rollout(flown.states[:, 0], exogenous, flown.actions), flown.states).mean()
     gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, list(twin.closure.parameters()))])
@@ -186,14 +186,14 @@ def test_matrix_is_the_hessian_where_the_residual_vanishes():
     twin, flown, exogenous = recorded(plant)
     twin.closure.load_state_dict(plant.closure.state_dict())
     assimilation, weight = Assimilation(twin, AssimilationConfig()), twin.closure.matrix
-    found = assimilation.normal_equations(flown)
+    found = assimilation.likelihood(flown).normal_equations()
     columns, step = [], 1e-5
     for k in range(weight.numel()):
         gradients = []
         for sign in (1.0, -1.0):
             with torch.no_grad():
                 weight.view(-1)[k] += sign * step
-                gradients.append(assimilation.normal_equations(flown).gradient)
+                gradients.append(assimilation.likelihood(flown).normal_equations().gradient)
                 weight.view(-1)[k] -= sign * step
         columns.append((gradients[0] - gradients[1]) / (2.0 * step))
     # step² of the central difference and the rounding 1e-16/1e-5, both about 1e-10 of the matrix.
@@ -204,7 +204,7 @@ def test_levenberg_marquardt_identifies_the_closure_to_rounding():
     plant = LinearQuadratic(noise=0.0)
     twin, flown, exogenous = recorded(plant)
     assimilation = Assimilation(twin, AssimilationConfig())
-    LevenbergMarquardt(twin.closure).run(lambda: assimilation.normal_equations(flown), iterations=15)
+    LevenbergMarquardt(twin.closure).run(lambda: assimilation.likelihood(flown).normal_equations(), iterations=15)
     # The record is noise-free and J_p quadratic at its minimum: Newton's convergence ends in rounding.
     torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-8)
 

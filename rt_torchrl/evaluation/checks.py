@@ -88,22 +88,6 @@ def _gradient(
     return torch.cat([part.flatten() for part in gradient]), cost.item()
 
 
-class Probe(nn.Module):
-    """A closure that returns what another closure returns, and keeps the features that it was called with.
-
-    Args:
-        closure: closure that gives the coefficients.
-    """
-
-    def __init__(self, closure: nn.Module):
-        super().__init__()
-        self.closure = closure
-
-    def forward(self, features: Tensor) -> Tensor:
-        self.features = features
-        return self.closure(features)
-
-
 @torch.no_grad()
 def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elements n_f"]:
     """The features on which the vector field calls its closure, in every sample of a real episode.
@@ -112,11 +96,15 @@ def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elem
         plant: plant with the closure of the real system.
         record: the real episode.
     """
-    probe = Probe(plant.closure)
+    seen = list[Tensor]()
+    hook = plant.closure.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
     t = record.start + plant.dt * clock
-    plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, probe)
-    return probe.features
+    try:
+        plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, plant.closure)
+    finally:
+        hook.remove()
+    return seen[-1]
 
 
 @torch.no_grad()

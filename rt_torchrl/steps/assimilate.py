@@ -253,10 +253,6 @@ class Assimilation:
         except FloatingPointError:
             return torch.full_like(noise, math.inf)
 
-    def normal_equations(self, replayed: Trajectory) -> NormalEquations:
-        """J_p, gradient and Gauss-Newton matrix by all unknowns; DivergenceError if a state is not finite."""
-        return self.likelihood(replayed).normal_equations()
-
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.
 

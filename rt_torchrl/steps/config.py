@@ -29,9 +29,9 @@ class LearnerConfig:
     Args:
         algorithm: model-free method, a loss of TorchRL: ``ddpg``; ``relaxed_ddpg``, DDPG as the paper prints it, whose
             critic is its own target and takes the share τ of every step, without importance weights and a limit of the
-            policy's gradient; ``td3``, which takes the lower value of two
-            critics, delays the policy and smooths the targets; or one that also prices the entropy of a policy with
-            noise: ``sac``, ``crossq`` (normalised layers instead of targets) or ``redq`` (more critics).
+            policy's gradient; ``td3``, which takes the lower value of two critics, delays the policy and smooths the
+            targets; or one that also prices the entropy of a policy with noise: ``sac``, ``crossq`` (normalised layers
+            instead of targets) or ``redq`` (more critics).
         critic_iterations: number n_Q of critic iterations per episode.
         actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every second critic
             iteration instead, the others one for each.

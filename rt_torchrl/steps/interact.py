@@ -390,30 +390,24 @@ class Operating:
         while not policy_flew or self.operation.waiting():
             if flights and flights[-1].whole and self.step.config.arm != "model_free":
                 self.step.virtual.learn(flights[-1].record)  # step 3 fits the last one
-            flight = self._taken()
+            needed = self.step.virtual.wanting(self.step.config.arm)
+            flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=needed)
             self.step.short_term.append(flight.record)
             flights.append(flight)
             order = self._order_of(flight)
-            if order.name != FIRST:
-                policy_flew = True
-                self._note(flight, order)
+            if order.name == FIRST:
+                continue
+            policy_flew = True
+            if flight.whole:  # costs of parts cannot be compared with those of windows
+                role, cost = cast(Role, order.name), flight.cost.item()
+                explored = order.strength * self._exploration.spread
+                self.step.belief.append(flight.record, role, cost, explored, order.weights)
         return flights, self._report(flights)
-
-    def _taken(self) -> Flight:
-        needed = self.step.virtual.wanting(self.step.config.arm)
-        return self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=needed)
 
     def _order_of(self, flight: Flight) -> Order:
         versions = flight.transitions["version"].flatten()
         found, counts = versions.unique(return_counts=True)
         return self.operation.orders[int(found[counts == counts.max()].max())]
-
-    def _note(self, flight: Flight, order: Order) -> None:
-        if not flight.whole:
-            return  # costs of parts cannot be compared with those of windows
-        role, cost = cast(Role, order.name), flight.cost.item()
-        explored = order.strength * self._exploration.spread
-        self.step.belief.append(flight.record, role, cost, explored, order.weights)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])

@@ -313,18 +313,14 @@ class ActorCritic:
         transitions = episode.select(*TRANSITION).clone()
         transitions["action"] = self.actor.scaled(transitions["action"])
         if over:
-            transitions["next", "reward"][-1] += self.end_value()
+            discount = self.config.discount  # what comes after the last reward, −γ L_e/(1 − γ)
+            transitions["next", "reward"][-1] -= discount * (self._end_cost or 0.0) / (1.0 - discount)
         transitions["next", "reward"] = self.config.reward_scale * transitions["next", "reward"]
         returns = self._returns(transitions.unsqueeze(0))[0, :whole]
         if over:  # TorchRL moves all that is next, but not what says whether it is an end
             last = torch.arange(whole, device=returns.device) + returns["steps_to_next_obs"].flatten() == whole
             returns["next", "terminated"] = last.unsqueeze(-1)
         return returns.select(*BATCH, strict=False)
-
-    def end_value(self) -> float:
-        r"""What comes after the last reward of an episode that ends early, :math:`-\gamma L_e/(1 - \gamma)`."""
-        discount = self.config.discount
-        return -discount * (self._end_cost or 0.0) / (1.0 - discount)
 
     @torch.no_grad()
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
@@ -772,13 +768,8 @@ class LeastPriorityWriter(Writer):
         """Read nothing; see :meth:`load_state_dict`."""
 
 
-@runtime_checkable
-class MakeLearner(Protocol):
-    """A function that makes the learner of step 2; :class:`ActorCritic` describes the arguments."""
-
-    def __call__(
-        self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator
-    ) -> Learner: ...
+MakeLearner = Callable[..., Learner]
+"""Function of plant, policy, :class:`LearnerConfig` and ``generator=`` that makes the learner of step 2."""
 
 
 class Learn(Step):

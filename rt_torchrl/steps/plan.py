@@ -194,13 +194,8 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
     )
 
 
-@runtime_checkable
-class MakePlanner(Protocol):
-    """A function that makes the planner of step 5; :func:`make_planner` describes the arguments."""
-
-    def __call__(
-        self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator
-    ) -> Planner: ...
+MakePlanner = Callable[..., Planner]
+"""Function that makes the planner of step 5; :func:`make_planner` describes the arguments."""
 
 
 class Plan(NamedTuple):

@@ -143,16 +143,13 @@ class ShortHorizon:
         self._improve_critic(costs.detach(), seen.detach(), over)
         return norm
 
-    def _end_value(self) -> float:
-        """The value v of an episode that has ended."""
-        return (self.twin.plant.end_cost or 0.0) / self.reference
-
     def _values(
         self, seen: Float[Tensor, "*batch n_o"], over: Bool[Tensor, "*batch"] | None
     ) -> Float[Tensor, "*batch"]:
         """What the slow critic estimates, or the value of an end."""
         found: Tensor = self.target(seen).squeeze(-1)
-        return found if over is None else torch.where(over, self._end_value(), found)
+        end = (self.twin.plant.end_cost or 0.0) / self.reference
+        return found if over is None else torch.where(over, end, found)
 
     def _improve_policy(
         self,
