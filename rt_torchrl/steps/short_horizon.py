@@ -148,8 +148,9 @@ class ShortHorizon:
     ) -> Float[Tensor, "*batch"]:
         """What the slow critic estimates, or the value of an end."""
         found: Tensor = self.target(seen).squeeze(-1)
-        end = (self.twin.plant.end_cost or 0.0) / self.reference
-        return found if over is None else torch.where(over, end, found)
+        if over is None:
+            return found
+        return torch.where(over, (self.twin.plant.end_cost or 0.0) / self.reference, found)
 
     def _improve_policy(
         self,
