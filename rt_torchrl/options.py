@@ -109,17 +109,20 @@ def read_options(options: type[Options], values: dict[str, Any]) -> Options:
 
 def in_words(error: ValidationError, options: type) -> str:
     """A sentence for each thing that pydantic refuses."""
-    return " ".join(_sentence(entry, options.__name__) for entry in error.errors(include_url=False))
+    return " ".join(_sentence(entry, options) for entry in error.errors(include_url=False))
 
 
-def _sentence(entry: Any, owner: str) -> str:
+def _sentence(entry: Any, options: type) -> str:
     kind = entry["type"]
     context = {key: f"{value:g}" if isinstance(value, float) else value for key, value in entry.get("ctx", {}).items()}
-    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in entry["loc"]).removeprefix(".")
+    place = entry["loc"]
+    if place and isinstance(place[0], int):  # an option that was given by its place
+        place = [field.name for field in dataclasses.fields(options)][place[0]], *place[1:]
+    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).removeprefix(".")
     if kind == "value_error":  # in words of its own
         return ": ".join(filter(None, (name, str(context["error"]))))
     if kind == "unexpected_keyword_argument":
-        return f"{owner} has no option {name}; it is of another version or recipe."
+        return f"{options.__name__} has no option {name}; it is of another version or recipe."
     if kind == "missing":
         return f"{name} is missing."
     shown = f"{name}={entry['input']!r}"

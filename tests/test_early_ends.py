@@ -272,6 +272,17 @@ def test_real_episodes_cost_what_simulated_ones_do():
     assert MILLIMETRES[0] == 1e3 and (flown.states[:, -1, 0].abs() > plant.reach).all()
 
 
+def test_episodes_that_end_at_once_say_so_and_what_to_do():
+    """The rod falls within ten intervals whatever acts; the reasons of the refusals were empty once."""
+
+    class Brittle(Falling):
+        A = ((0.0, 1.0), (100.0, 0.0))
+
+    with pytest.raises(ValueError, match=r"3 real episodes in a row .* \(ended\) after \d+ of .*--start contr"):
+        for _ in range(9):
+            algorithm(PlantEnv(Brittle(), seed=2), Brittle()).episode()
+
+
 def test_an_end_where_the_plant_has_none_is_refused():
     plant = Falling()
     plant.reach = 100.0  # so that the plant goes on

@@ -5,7 +5,6 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict import TensorDict
 
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.sampling import rk4_step
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -34,35 +33,6 @@ def test_step_is_one_runge_kutta_step_of_the_true_system():
     # The same sums in another order.
     torch.testing.assert_close(done["next", "state"], expected, rtol=1e-13, atol=1e-14)
     assert torch.equal(done["next", "applied"], action)
-
-
-def test_stored_next_state_is_the_state_of_the_next_step():
-    env = PlantEnv(LinearQuadratic(horizon=1.0), batch_size=2)
-    found = env.reset()
-    seen, later = [], []
-    for k in range(10):
-        done, following = env.step_and_maybe_reset(found.set("action", uniform_actions(env, k)))
-        seen.append(done.clone())
-        later.append(following.clone())
-        found = following
-    for before, after in zip(seen[:-1], seen[1:], strict=True):
-        for key in ("state", "exogenous", "observation"):
-            assert torch.equal(before["next", key], after[key])
-    # After the end a new episode starts, but what is stored is where the old one ended.
-    assert seen[-1]["next", "truncated"].all() and not later[-1]["done"].any()
-    assert not torch.equal(seen[-1]["next", "state"], later[-1]["state"])
-
-
-def test_input_of_an_interval_is_that_of_the_draw():
-    plant = LinearQuadratic(horizon=1.0)
-    env = PlantEnv(plant, batch_size=2, seed=4)
-    generator = torch.Generator().manual_seed(4)
-    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
-    episode = env.rollout(20)
-    assert torch.equal(episode["state"][:, 0], state)
-    assert torch.equal(episode["exogenous"], exogenous)
-    # After the last interval there is no further input; its observation is made with the last one.
-    assert torch.equal(episode["next", "exogenous"][:, -1], exogenous[:, -1])
 
 
 class Clock(LinearQuadratic):
@@ -132,39 +102,6 @@ def test_partial_reset_restarts_the_marked_rows_only():
     assert [row[1] for row in ends].index(True) == 9
 
 
-def test_seed_fixes_the_sequence_of_episodes():
-    def starts(env):
-        return torch.stack([env.reset()["state"] for _ in range(3)])
-
-    env, same, other = (PlantEnv(LinearQuadratic(), batch_size=2, seed=seed) for seed in (3, 3, 4))
-    first = starts(env)
-    assert torch.equal(first, starts(same)) and not torch.equal(first, starts(other))
-    assert not torch.equal(first[0], first[1])
-    env.set_seed(3)
-    assert torch.equal(first, starts(env))
-
-
-def test_turbine_actuators_are_rate_limited():
-    """Torque by at most 15 kN m/s and pitch by 8 deg/s, from what was applied before, not from what was asked."""
-    env = PlantEnv(WindTurbine(horizon=20.0), batch_size=16, seed=6)
-    found = env.reset()
-    limit = torch.tensor([15e3, 8.0], dtype=torch.float64) * 0.5
-    last, limited, free = found["state"][:, 4:], 0, 0
-    for k in range(40):
-        action = uniform_actions(env, k)
-        step = act(env, found, action)["next"]
-        applied = step["applied"]
-        expected = last + (action - last).sign() * torch.minimum((action - last).abs(), limit)
-        # One rounding of numbers up to 4e4.
-        torch.testing.assert_close(applied, expected, rtol=1e-14, atol=1e-10)
-        assert torch.equal(step["state"][:, 4:], applied)
-        reached = (action - last).abs() <= limit
-        limited, free = limited + (~reached).sum(0), free + reached.sum(0)
-        last, found = applied, step.exclude("reward")
-    # Both branches have been seen for both actions.
-    assert (limited > 20).all() and (free > 20).all()
-
-
 class Explosive(LinearClosure):
     def forward(self, features):
         return 1e3 * features**3
@@ -201,15 +138,6 @@ def test_sensors_err_by_a_share_of_what_they_read():
     # On this plant the observation is the state, and what is read at the end of a step is what the next one sees.
     assert torch.equal(read["observation"], read["state"])
     assert torch.equal(read["next", "state"][:, :-1], read["state"][:, 1:])
-
-
-def test_a_reward_is_that_of_the_true_state():
-    plant = LinearQuadratic(noise=0.0)
-    clean, noisy = (PlantEnv(plant, batch_size=3, seed=1, noise=noise) for noise in (0.0, 0.3))
-    rewards = []
-    for env in (clean, noisy):
-        rewards.append(act(env, env.reset(), torch.full((3, 1), 0.5).double())["next", "reward"])
-    assert torch.equal(*rewards)
 
 
 def test_the_real_system_wears_from_episode_to_episode():

@@ -139,14 +139,6 @@ def test_the_first_episode_is_whole():
     assert alone.episode()["sound_intervals"] == 38
 
 
-def test_a_frozen_sensor_is_known_for_wrong_from_its_first_repetition():
-    found = algorithm(guarded(faulty("frozen", 8, 12), frozen={"state": 5}))
-    found.episode()
-    found.episode()
-    # Readings 9 to 13 repeat the one before: five in a row are there at reading 12.
-    assert found.flights.faults[0].interval == 11 and found.short_term[-1].start == pytest.approx(14 * DT)
-
-
 @pytest.mark.parametrize("figures", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     plant = LinearQuadratic(horizon=DT * N)
@@ -181,19 +173,3 @@ def algorithm_of(run, system):
         config=made.config,
         generator=made.generator,
     )
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"kind": "broken"}, "kind='broken' does not exist"),
-        ({"kind": "nan", "first": 3, "last": 2}, "first=3 and last=2"),
-        ({"kind": "nan", "component": 7}, "has no place"),
-        ({"kind": "nan", "entry": "speed"}, "has no place"),
-        ({"kind": "slow_actuator", "value": 1.0}, "share of the way"),
-    ],
-)
-@pytest.mark.usefixtures("unchecked")
-def test_injections_that_cannot_be_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        guarded(Injection(**options))

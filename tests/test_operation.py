@@ -120,15 +120,6 @@ def test_a_run_goes_on_from_its_state_to_the_bit(continuous):
     assert torch.equal(weights(whole), weights(other))
 
 
-def test_a_continuous_operation_begins_a_window_where_the_last_one_ended():
-    plant = LinearQuadratic(horizon=1.0)
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    found = operation_of(continuous=True)(plant, {"only": policy}, small(QUIET))
-    found.hand_over("only", policy, strength=0.0)
-    first, second = found.rollout(), found.rollout()
-    assert torch.equal(first["next", "state"][:, -1], second["state"][:, 0])
-
-
 class Constant(torch.nn.Module):
     """A policy that always commands the same."""
 
@@ -168,18 +159,6 @@ def test_the_handover_keeps_the_actuators_own_rate():
     assert steps[0] <= 7500.0 + 1e-6 and steps[1] <= 4.0 + 1e-9
     # Nothing is lost in the actuators, so that what the learner reads is what the policies wanted.
     torch.testing.assert_close(applied[20:], action[20:])
-
-
-def test_integrators_of_the_plant_carry_over():
-    """The speed error's integral is a state; its course has no step where another policy takes over."""
-    plant = WindTurbine(horizon=30.0)
-    window = handed_over(plant, Constant(4e4, 5.0), Constant(1e4, 0.0), 65)
-    integral = window["state"][:, 3]
-    slope = plant.vector_field(
-        torch.zeros(60).double(), window["state"], window["next", "applied"], window["exogenous"], plant.closure
-    )[:, 3]
-    # Half a second is short against the window of five seconds of the integral.
-    assert (integral.diff() - 0.5 * slope[:-1]).abs().max() < 0.05 * integral.diff().abs().max() + 5e-3
 
 
 @pytest.mark.parametrize(
@@ -423,16 +402,3 @@ def test_what_cannot_be_sent_is_refused():
     crew = Crew(lambda: PlantEnv(SHORT), SHORT, policies, QUIET, OperationConfig(clock="wall"), seed=1)
     with pytest.raises(ValueError, match="cannot be sent to a process of its own"):
         ProcessOperation(crew, PlantEnv(SHORT))
-
-
-def test_options_of_an_operation_need_the_operation(tmp_path):
-    with pytest.raises(ValueError, match=r"operation\.\* says how an asynchronous run operates; give --asynchronous"):
-        small_run(tmp_path, operation=OperationConfig(handover=5))
-
-
-def test_an_interrupted_asynchronous_run_goes_on_to_the_bit(tmp_path):
-    whole = small_run(tmp_path / "whole", episodes=3, asynchronous=True).train()
-    small_run(tmp_path / "half", episodes=2, asynchronous=True).train()
-    resumed = small_run(tmp_path / "half", episodes=3, asynchronous=True, resume=True).train()
-    for one, other in zip(whole["episodes"], resumed["episodes"], strict=True):
-        assert one["real_cost"] == other["real_cost"] and one["closure"] == other["closure"]

@@ -199,13 +199,6 @@ def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
     assert paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
 
 
-def test_flights_on_a_system_that_is_none_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="real_unseen=2 .* needs a real system"):
-        small_run(tmp_path, real_unseen=2)
-    with pytest.raises(ValueError, match="real_unseen=1 must be 0, or at least 2"):
-        RunConfig(real_unseen=1)
-
-
 def test_after_an_interrupt_nothing_flies(tmp_path):
     """Who has pressed Ctrl-C may have done so because of what the system did."""
     rig = machine()
@@ -322,40 +315,6 @@ def test_episodes_of_a_simulation_are_every_second_draw_of_its_seed(guarded):
         assert torch.equal(record.states[0], state[0]) and torch.equal(record.exogenous, exogenous[0])
 
 
-class Costly(PlantEnv):
-    """A simulation of somebody's own that costs twice as much, and starts at rest."""
-
-    def _reset(self, tensordict=None, **kwargs):
-        found = super()._reset(tensordict, **kwargs)
-        self._state = torch.zeros_like(self._state)
-        return found.set("state", self._state.clone()).set("observation", self._state.clone())
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        return found.set("reward", 2.0 * found["reward"])
-
-
-def test_what_a_subclass_overrides_takes_effect():
-    plant = LinearQuadratic(horizon=HORIZON)
-    found = algorithm(Costly(plant, seed=4))
-    report, record = flown(found), found.short_term[-1]
-    assert torch.equal(record.states[0], torch.zeros(2).double())
-    cost = plant.running_cost(torch.zeros(20).double(), record.states[:-1], record.actions, record.exogenous)
-    # Rounding of twenty sums.
-    torch.testing.assert_close(report["real_cost"], 2.0 * cost.mean(), rtol=1e-12, atol=0.0)
-
-
-@pytest.mark.parametrize("batch", [2, 3])
-def test_several_systems_at_once_are_refused(batch):
-    with pytest.raises(ValueError, match=rf"batch_size=\({batch},\) of the real system .* one episode .* batch_size=1"):
-        algorithm(PlantEnv(LinearQuadratic(horizon=HORIZON), batch_size=batch))
-
-
-def test_a_system_without_a_batch_is_refused():
-    with pytest.raises(ValueError, match=r"batch_size=\(\) of the real system .* RealSystem"):
-        algorithm(Rig(LinearQuadratic(horizon=HORIZON)))
-
-
 class Ends(PlantEnv):
     """Falls over after seven intervals."""
 
@@ -392,12 +351,6 @@ class Blind(PlantEnv):
     def _step(self, tensordict):
         found = super()._step(tensordict)
         return found.set("observation", found["observation"] * torch.nan) if self._step_count >= 4 else found
-
-
-def test_a_layer_that_has_flown_nothing_has_an_empty_report():
-    """A check of a protocol reads it before the first episode, in some processes."""
-    layer = SafetyLayer(PlantEnv(LinearQuadratic(horizon=HORIZON), seed=4), SafetyConfig(interval=0.1), fallback=(0.0,))
-    assert not layer.reports and not layer.report.events and not layer.report.counts
 
 
 # Nothing is flown twice.

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import re
 import threading
 
 import gymnasium
@@ -138,13 +137,6 @@ def test_an_episode_of_gymnasium_takes_one_reset_with_its_own_seed(layer):
     assert torch.equal(system.reset()["state"][0], starts[0]) and not torch.equal(starts[0], starts[1])
 
 
-def test_a_system_without_seeds_goes_on_as_it_is():
-    plant = LinearQuadratic(horizon=1.0)
-    rig = Rig(plant, seed=5)
-    starts = [connected(plant, rig=rig, seed=None).reset()["state"] for _ in range(2)]
-    assert not torch.equal(*starts)
-
-
 def run_on(env, folder, *, figures=False, **options):
     own = {"compiled": False, "unseen": 3, "figures": figures, "figures_every": 0, "twinning": SMALL}
     config = RunConfig(log_dir=folder, **own, **options)
@@ -234,23 +226,6 @@ def test_a_constant_stands_in_for_an_input_that_is_not_reported():
     assert found["exogenous"].tolist() == [[0.3]]
 
 
-def test_a_batch_of_systems_is_refused():
-    with pytest.raises(ValueError, match=r"batch_size=\(3,\) of the environment must be"):
-        RealSystem(PlantEnv(LinearQuadratic(), batch_size=3), LinearQuadratic(), state=STATE)
-
-
-def test_what_is_no_environment_of_torchrl_is_refused(unchecked):
-    with pytest.raises(ValueError, match="env is a object; wrap it first, such as torchrl.envs.GymWrapper"):
-        RealSystem(object(), LinearQuadratic(), state=STATE)
-
-
-def test_an_episode_that_ends_early_is_refused():
-    plant = LinearQuadratic(horizon=2.0)
-    system = connected(plant, rig=Rig(plant, ends_after=7))
-    with pytest.raises(ValueError, match=r"truncated the episode after 7 of 20 control intervals .* at most 0.7 s"):
-        system.rollout(20)
-
-
 class Forgetful(Rig):
     """A rig that leaves one entry out of its report from its third step on."""
 
@@ -279,14 +254,6 @@ def test_a_step_that_does_not_report_what_is_read_is_refused(forgets, what, opti
     assert system.env.count == 3
 
 
-def test_a_time_limit_below_the_horizon_is_refused_before_anything_moves():
-    gymnasium = pytest.importorskip("gymnasium")
-    plant = Pendulum(horizon=10.0)
-    env = GymWrapper(gymnasium.make("Pendulum-v1", max_episode_steps=150))
-    with pytest.raises(ValueError, match=r"truncates an episode after 150 of the 200 .* at most 7.5 s"):
-        RealSystem(env, plant, state=Reading(of=angle_and_speed))
-
-
 def test_a_reading_that_is_not_finite_is_refused():
     """It is refused when it is read; before that, zeros take the place of a report, and may read as anything."""
     plant = LinearQuadratic()
@@ -296,24 +263,6 @@ def test_a_reading_that_is_not_finite_is_refused():
     plant.draw_initial_state = lambda batch, generator: torch.zeros(batch, 2).double()
     with pytest.raises(ValueError, match=r"state \['position', 'velocity'\], read from .*is not finite: \[nan, nan\]"):
         system.reset()
-
-
-def test_a_scale_of_zero_is_refused():
-    with pytest.raises(ValueError, match=r"scale=\(1.0, 0.0\)"):
-        Actuation(scale=(1.0, 0.0))
-
-
-@pytest.mark.parametrize("kind", [Reading, Actuation])
-@pytest.mark.parametrize("argument", ["scale", "offset"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), (1.0, float("-inf"))])
-def test_units_that_are_no_numbers_are_refused(kind, argument, value):
-    with pytest.raises(ValueError, match=f"{argument}={re.escape(str(value))} of the {kind.__name__.lower()}"):
-        kind(**{argument: value})
-
-
-def test_a_constant_input_that_is_no_number_is_refused():
-    with pytest.raises(ValueError, match=r"exogenous=\(nan,\)"):
-        connected(LinearQuadratic(), exogenous=(float("nan"),))
 
 
 # What a run on a real system refuses, because only a plant in simulation can do it, and the other way round.
@@ -444,19 +393,6 @@ def test_an_episode_that_is_left_ends_the_simulator():
         env.rollout(4, lambda td: td.set("action", torch.zeros(1, dtype=torch.float64)))
     env.close()
     assert CALLS == ["EpisodeAbandoned"] * 3 and threading.active_count() == threads
-
-
-def test_what_fails_in_the_simulator_is_told_where_it_is_stepped():
-    def breaks(seed, controller):
-        controller({"place and rate": np.zeros(2)})
-        raise ZeroDivisionError("blade gone")
-
-    env = environment(breaks)
-    start = env.reset()
-    with pytest.raises(RuntimeError, match="the simulator failed: ZeroDivisionError: blade gone"):
-        env.step(start.set("action", torch.zeros(1, dtype=torch.float64)))
-    with pytest.raises(RuntimeError, match="without calling its controller"):
-        environment(lambda seed, controller: None).reset()
 
 
 def within(seconds, call):

@@ -61,12 +61,6 @@ def test_a_command_that_is_missing_or_wrong_brings_the_safe_action_in_its_interv
     assert plant.missed == 3
 
 
-def test_the_safe_action_acts_before_the_first_command():
-    plant = ServedPlant(PLANT, (0.25,))
-    plant.advance(math.nan, [math.nan])
-    assert plant.published()["applied.force"] == 0.25 and plant.safe
-
-
 @pytest.mark.parametrize("safe", [(), (0.0, 0.0), (math.nan,), (2.5,)])
 def test_a_safe_action_that_does_not_fit_is_refused(safe):
     with pytest.raises(ValueError, match="safe=.* must be one number within the range of each action"):
@@ -155,16 +149,6 @@ def test_a_client_keeps_its_period_while_the_line_is_down_and_goes_on_afterwards
     assert max(b - a for a, b in zip(times, times[1:], strict=False)) <= 0.15 + 1e-9
     assert row["applied"].item() == 1.0
     env.close()
-
-
-def test_a_plant_whose_samples_stand_still_is_not_read_as_new():
-    line = Line(Time(), 0.1)
-    env = connected(line)
-    row = steps(env, 5)[-1]
-    kept = line.plant.published()
-    line.plant.published = lambda: kept
-    row = env.step(row.set("action", torch.tensor([1.0]).double()))["next"]
-    assert row["state"].isnan().all() and env.stale == 1 and env.losses == 0
 
 
 def test_a_plant_that_never_answers_is_said_in_a_sentence():
