@@ -14,11 +14,11 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from study import Training, run_all
 
 from rt_torchrl import LoadedRun, configuration, load_run, main_of
 from rt_torchrl.figures.style import ROLES, TWIN, array, caption, legend_below, panels, role_name
 from rt_torchrl.steps.config import ROLES as POLICIES
-from rt_torchrl.study.sweep import seeded_runs, train_all
 
 RATIOS = {
     "wind_turbine": {"J_p": (0.21, 0.08), "model_based": (0.08, 0.05), "model_free": (0.13, 0.12)},
@@ -217,8 +217,10 @@ def main(config: Config) -> None:
     from rt_torchrl.figures import save_figure
 
     folder = config.log_dir / config.plant
-    runs = seeded_runs(Path(__file__).with_name(f"{config.plant}.py"), config.seeds, folder, OPTIONS)
-    train_all(runs, config.jobs)
+    recipe = Path(__file__).with_name(f"{config.plant}.py")
+    runs = [Training(recipe, OPTIONS, seed, folder / f"seed-{seed}") for seed in config.seeds]
+    if failures := run_all(runs, jobs=config.jobs):
+        raise ValueError("\n".join(failures))
     metrics = [
         json.loads((one.folder / "metrics.json").read_text(encoding="utf-8")) | {"seed": one.seed} for one in runs
     ]

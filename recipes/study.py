@@ -1,289 +1,459 @@
-"""The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
+"""Arms of the algorithm on several systems over many seeds: one table, one figure, and the best that is possible."""
 
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import re
+import shlex
+import statistics
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Any, Literal
 
 from rt_torchrl import begin_loading
 
 if __name__ == "__main__":
     begin_loading()
 
-import tyro
+import torch
 
-from rt_torchrl import main_of
-from rt_torchrl.envs.unknown_systems import SYSTEMS
-from rt_torchrl.runs.run_config import QUICK_UNSEEN
-from rt_torchrl.study.contenders import (
-    ARMS,
-    CONTROLLERS,
-    COUNTS,
-    EPISODES,
-    MULTIPLES,
-    OTHER_CLOSURE,
-    OTHER_PLANT,
-    OWN_POLICY,
-    QUICK_VARIANTS,
-    SHORT,
-    SHORT_EPISODES,
-    policies_of,
-)
-from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
-from rt_torchrl.study.scheduling import side_by_side
-from rt_torchrl.study.task import Task
-from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.unknown import by_plant
-from rt_torchrl.study.yardstick import Yardstick
-from rt_torchrl.study.yardsticks import (
-    classical,
-    cost_along_gain,
-    cost_over_episodes,
-    least_cost,
-    oracle,
-    plans,
-    predictive_control,
-)
+from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
+from rt_torchrl.atomic_file import make_folder, write_results
+from rt_torchrl.evaluation.limits import FOR_PERCEPTRONS, exact_optimum, few_starts, limit
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.interruption import Interrupted, termination_as_interrupt
+from rt_torchrl.options import AtLeastOne, Count
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.compare import FinishedRun, Row, markdown, with_interval
+from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of
+from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings
+from rt_torchrl.steps.config import Arm
+
+PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
+ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
+OWN = ("--seed", "--log-dir", "--resume", "--overwrite", "--threads", "--unseen-every", "--config")
+"""Options that the study gives every run itself."""
+EVERY = ("--threads", "1", "--unseen-every", "1", "--untrained", "0", "--figures-every", "0", "--no-figures")
+QUICK_EFFORT = {"starts": 1, "approach": 100, "iterations": 20, "polish": 5}
+"""Effort of the search for the optimum with ``quick``."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
-    """Train every arm on every plant, tune the classical controllers, find the oracle, and write tables and figures.
+    """Train arms on systems over seeds, and compare their costs with classical controllers and the optimum.
 
-    The folder keeps finished results, so that the same command goes on where it was interrupted.
+    Every training is a run in SYSTEM/ARM/seed-SEED of the folder. Finished ones are kept, so that the same command goes
+    on where it was interrupted. The results are study.md, study.json and study.png.
 
     Args:
-        plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
-        seeds: number of trainings of every arm.
-        unknown: what the real systems have beside their twins, as names of --unknown of the plants' recipes. A name
-            counts for every plant that has it, and each plant needs one. Model error, another real system, is then left
-            out. The results lie in folders of their own.
-        variant_seeds: number of trainings of every arm under each sensor noise and model error; 0 leaves them out.
-        jobs: number of trainings side by side, one thread each; 0 means one for every core of the machine or cluster.
-        unseen: number of unseen episodes that judge everything.
-        limit_episodes: number of unseen episodes, the first ones, on which the limit and model predictive control are
-            computed; 0 leaves them out.
-        folder: folder of tables, figures and all runs.
-        quick: make the same tables from one seed of short trainings, and mark it as quick.
+        systems: recipes with options in quotation marks, such as "wind_turbine --unknown pitch", perhaps with a name,
+            as in "pitch=wind_turbine --unknown pitch"; by default the three plants, or with quick the turbine.
+        arms: options that the systems are trained with, each with a name, such as
+            "sac=--twinning.learner.algorithm sac", or an arm of the algorithm: twinning, model_based or model_free.
+            The others are compared with the first.
+        seeds: number of trainings of each arm on each system, with the seeds from 0 on.
+        given: options of every training, in one word with the option, as in --given="--episodes 10 --unseen 100".
+        optimum: whether to seek the least cost of the class of policies, by exact gradients on the true system.
+        limit: number of unseen episodes, the first ones, whose clairvoyant optimum is computed; 0 for none.
+        jobs: number of trainings side by side, each with one thread; 0 for one on each core.
+        backend: where they run: loky for processes on this machine, or ray for the cluster that RAY_ADDRESS names,
+            whose machines share the folder.
+        quick: make two seeds of small trainings.
+        runs: folders of finished runs of one plant, which are compared instead of training; those that differ in
+            nothing but the seed are one row.
+        log_dir: folder of the runs and of the results.
     """
 
-    plants: tuple[str, ...] = ("all",)
-    unknown: tuple[str, ...] = ()
-    seeds: int = 5
-    variant_seeds: int = 1
-    jobs: int = 0
-    unseen: int = 100
-    limit_episodes: int = 8
-    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/study")
+    systems: tuple[str, ...] = ()
+    arms: tuple[str, ...] = ARMS
+    seeds: AtLeastOne = 5
+    given: str = ""
+    optimum: bool = True
+    limit: Count = 0
+    jobs: Count = 0
+    backend: Literal["loky", "ray"] = "loky"
     quick: bool = False
+    runs: tuple[Path, ...] = ()
+    log_dir: Path = Path("runs/study")
 
     def __post_init__(self):
-        unknown = [name for name in self.plants if name not in (*CONTROLLERS, "all")]
-        if unknown or not self.plants:
-            raise ValueError(f"plants={self.plants} must be all, or some of {', '.join(CONTROLLERS)}.")
-        for argument, least in (("seeds", 1), ("variant_seeds", 0), ("jobs", 0), ("unseen", 2)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
-        if self.limit_episodes not in (0, *range(2, self.unseen + 1)):
-            raise ValueError(f"limit_episodes={self.limit_episodes} must be 0, or from 2 to unseen={self.unseen}.")
-        self.beside()
+        if self.limit == 1:  # unseen episodes are two or more
+            raise ValueError("limit=1 must be 0, or at least 2.")
+        if not self.arms:
+            raise ValueError("arms names none; give options, or twinning, model_based or model_free.")
 
-    def chosen(self) -> list[str]:
-        """Names of the plants."""
-        return list(CONTROLLERS) if "all" in self.plants else list(self.plants)
+    def systems_by_name(self) -> dict[str, tuple[Path, list[str]]]:
+        """Recipe and options of each system."""
+        systems = {}
+        for text in self.systems or (PLANTS[:1] if self.quick else PLANTS):
+            name, words = named(text)
+            if not words:
+                raise ValueError(f"systems: {text!r} names no recipe; write RECIPE OPTIONS or NAME=RECIPE OPTIONS.")
+            recipe = Path(words[0]) if words[0].endswith(".py") else Path(__file__).with_name(f"{words[0]}.py")
+            usual = re.sub(r"[^\w.+-]+", "-", "-".join(word.lstrip("-") for word in (recipe.stem, *words[1:])))
+            add("systems", systems, name or usual, (recipe, words[1:]))
+        return systems
 
-    def beside(self) -> dict[str, tuple[str, ...]]:
-        """What the real system of each plant has beside its twin, by names."""
-        return by_plant(self.unknown, {plant: SYSTEMS[plant] for plant in self.chosen()})
+    def arms_by_name(self) -> dict[str, list[str]]:
+        """Options of each arm."""
+        arms: dict[str, list[str]] = {}
+        for text in self.arms:
+            name, words = (text, ["--twinning.arm", text]) if text in ARMS else named(text)
+            if name is None:
+                raise ValueError(f"arms: {text!r} has no name; write NAME=OPTIONS, or one of {', '.join(ARMS)}.")
+            add("arms", arms, name, words)
+        return arms
 
-    @property
-    def kept(self) -> Path:
-        """Folder of the results; short trainings have their own, or the whole study would take theirs for its own."""
-        return self.folder / "quick" if self.quick else self.folder
+    def trainings(self) -> "dict[tuple[str, str], list[Training]]":
+        """The trainings by system and arm, over the seeds.
 
-    def kept_of(self, plant: str, kind: str) -> Path:
-        """Folder of the runs or yardsticks of a plant; each real system has its own."""
-        return self.kept / kind / "+".join((plant, *self.beside()[plant]))
+        Raises:
+            ValueError: if a recipe does not exist or refuses its options, or an option is one that the study gives
+                itself.
+        """
+        given, arms = [*shlex.split(self.given), *(["--quick"] if self.quick else [])], self.arms_by_name()
+        trainings = {}
+        for system, (recipe, of_system) in self.systems_by_name().items():
+            for arm, of_arm in arms.items():
+                words = (*of_system, *given, *of_arm)
+                if own := [word for word in words if word.split("=")[0].replace("_", "-") in OWN]:
+                    raise ValueError(f"{', '.join(own)}: the study gives these to each training itself; leave it out.")
+                folder = self.log_dir / system / arm
+                trainings[system, arm] = [
+                    Training(recipe, words, seed, folder / f"seed-{seed}")
+                    for seed in range(min(self.seeds, 2) if self.quick else self.seeds)
+                ]
+                trainings[system, arm][0].asked()  # a mistake ends it here and not in every training
+        return trainings
 
-    @property
-    def report(self) -> Path:
-        """Folder of the tables; the same names in another order give the same one."""
-        names = sorted({name for of_plant in self.beside().values() for name in of_plant})
-        return self.kept / "unknown" / "+".join(names) if names else self.kept
-
-    def variants(self) -> list[str]:
-        """Variants that are trained beside the nominal one."""
-        if not self.variant_seeds:
-            return []
-        left_out = ("nominal", *((CHANGED,) if self.unknown else ()))
-        return [variant for variant in (QUICK_VARIANTS if self.quick else VARIANTS) if variant not in left_out]
-
-    def episodes_of(self, plant: str) -> int:
-        """Number of real episodes in every training of a plant."""
-        return SHORT_EPISODES if self.quick else EPISODES[plant]
-
-    def options_of(self, plant: str) -> tuple[str, ...]:
-        """Further options of every training of a plant."""
-        size = ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
-        names = self.beside()[plant]
-        return (*OWN_POLICY[plant], *size, *(("--unknown", *names) if names else ()))
-
-    def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
-        """Trainings of a plant by variant and arm, each a list over the seeds."""
-        seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
-        base = self.kept_of(plant, "runs")
-
-        def every(arm: str, variant: str, count: int, *further: str, folder: str = "") -> list[Training]:
-            place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
-            every_option = (*self.options_of(plant), "--unseen-every", "1", *further)
-            common = {"recipe": recipe_of(plant), "arm": arm, "variant": variant, "options": every_option}
-            common["episodes"] = self.episodes_of(plant)
-            return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
-
-        found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
-        for name, policy in policies_of(plant, quick=self.quick).items():
-            found["nominal", name] = every(
-                "twinning", "nominal", seeds, *policy, folder="-".join(policy[:2]).strip("-")
-            )
-        return found | {(variant, arm): every(arm, variant, others) for variant in self.variants() for arm in ARMS}
-
-    def yardsticks(self, plant: str) -> dict[str, Yardstick]:
-        """The oracle and the classical controllers of a plant."""
-        place = self.kept_of(plant, "yardsticks")
-        unseen = QUICK_UNSEEN if self.quick else self.unseen
-        starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
-        best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
-        tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations, "changed": not self.unknown}
-        system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
-        found = {"oracle": partial(oracle, *system, **best)}
-        found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
-        return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
-
-    def limits(self, plant: str) -> dict[str, Yardstick]:
-        """The clairvoyant optimum of a plant, and model predictive control where it finds plans."""
-        if not self.limit_episodes:
-            return {}
-        count, iterations = (2, 100) if self.quick else (self.limit_episodes, 3000)
-        size = {"unseen": QUICK_UNSEEN if self.quick else self.unseen, "count": count}
-        system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
-        found = {"limit": partial(least_cost, *system, **size, iterations=iterations)}
-        if plans(*system):
-            found["mpc"] = partial(predictive_control, *system, **size)
-        place = self.kept_of(plant, "yardsticks")
-        return {name: Yardstick(place / f"{name}-{count}.json", compute) for name, compute in found.items()}
-
-    def line(self, plant: str) -> Yardstick | None:
-        """Costs of a plant along one quantity; None for a plant whose tables say enough."""
-        counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
-        proportional = CONTROLLERS["cryogenic_tank"]["PI"]
-        lines = {
-            "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=proportional, multiples=MULTIPLES)),
-            "flapping_wing": ("episode-line", partial(cost_over_episodes, counts=counts, iterations=iterations)),
-        }
-        if plant not in lines:
-            return None
-        name, compute = lines[plant]
-        unseen = QUICK_UNSEEN if self.quick else self.unseen
-        compute = partial(compute, recipe_of(plant), self.options_of(plant), unseen=unseen)
-        return Yardstick(self.kept_of(plant, "yardsticks") / f"{name}.json", compute)
+    def yardsticks(self, training: "Training") -> "dict[str, Yardstick]":
+        """What else is computed for the task and the policies of a training: ``optimum`` and ``limit``."""
+        asked = {"optimum": QUICK_EFFORT if self.quick else {}} if self.optimum else {}
+        asked |= {"limit": {"count": self.limit}} if self.limit else {}
+        place = self.log_dir / "yardsticks"
+        return {kind: Yardstick(kind, training.recipe, training.words, effort, place) for kind, effort in asked.items()}
 
 
-def recipe_of(plant: str) -> Path:
-    """The recipe of a plant."""
-    return Path(__file__).with_name(f"{plant}.py")
+def named(text: str) -> tuple[str | None, list[str]]:
+    """Name and words of ``NAME=WORDS``, or None and the words."""
+    name = re.match(r"(\w[\w.+-]*)=", text)
+    return (name[1], shlex.split(text[name.end() :])) if name else (None, shlex.split(text))
 
 
-def compute(config: Config) -> None:
-    """Compute everything that is not done yet, side by side, with one progress bar."""
-    batches = short_batches(config) if config.quick else [[task] for task in ordered_tasks(config)]
-    side_by_side(batches, jobs=config.jobs)
+def add(argument: str, known: dict[str, Any], name: str, value: Any) -> None:
+    """Add what has a name of its own."""
+    if name in known:
+        raise ValueError(f"{argument}: {name!r} stands for two; give names, as in NAME=OPTIONS.")
+    known[name] = value
 
 
-def ordered_tasks(config: Config) -> list[Task]:
-    """Yardsticks first, then the nominal trainings, then those of the other variants."""
-    tasks = [task for plant in config.chosen() for task in yardstick_tasks(config, plant)]
-    # The plant that takes longest comes first.
-    groups = [item for plant in reversed(config.chosen()) for item in config.trainings(plant).items()]
-    for _, group in sorted(groups, key=lambda item: item[0][0] != "nominal"):
-        tasks += group
-    return tasks
+@functools.cache
+def options_of(recipe: Path, words: tuple[str, ...]) -> RunConfig:
+    """The options of a recipe's command line, which takes some tenths of a second to read."""
+    return from_command_line(load_recipe(recipe).Config, words)
 
 
-def short_batches(config: Config) -> list[list[Task]]:
-    """Batches of tasks, one worker for each: tasks that share graphs share a worker, because tracing takes longest.
+@dataclass(frozen=True)
+class Training:
+    """A run of a recipe; it runs in the process that calls it, so that the next one finds everything compiled.
 
-    The longest batches come first; the others go wherever there is time.
+    Args:
+        recipe: file of the recipe.
+        words: options of the recipe.
+        seed: seed of the run.
+        folder: run folder.
     """
-    batches, rest = [], []
-    for plant in reversed(config.chosen()):
-        groups = config.trainings(plant)
-        together = [training for key, group in groups.items() if key[1] not in OTHER_PLANT for training in group]
-        others = [[training] for key, group in groups.items() if key[1] in OTHER_PLANT for training in group]
-        measures = yardstick_tasks(config, plant)
-        batches.append(together if plant in OTHER_CLOSURE else [*measures, *together])
-        rest += others + ([measures] if plant in OTHER_CLOSURE else [])
-    return batches + rest
+
+    recipe: Path
+    words: tuple[str, ...]
+    seed: int
+    folder: Path
+
+    def asked(self) -> RunConfig:
+        """The options of the run."""
+        return dataclasses.replace(options_of(self.recipe, (*EVERY, *self.words)), seed=self.seed, log_dir=self.folder)
+
+    def finished(self) -> bool:
+        """Whether all episodes are done.
+
+        Raises:
+            ValueError: if the folder holds a run of other options, or of more episodes.
+        """
+        if not (self.folder / FILE).is_file():
+            return False
+        asked = self.asked()
+        found = differences(self.folder, asked, HARMLESS - {"unseen_every"})
+        metrics = read_json(self.folder / "metrics.json")
+        done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes
+        if done > wanted:
+            found.append(f"episodes is {wanted} here and was {done} in the run")
+        if found:
+            raise ValueError(
+                f"{self.folder} holds a run of other options: {'; '.join(found)}. Give its options or another log_dir, "
+                "or remove the folder."
+            )
+        if metrics is None or done == wanted:
+            return metrics is not None
+        patient = read_settings(self.folder)["patience"] == asked.patience  # another patience may go on
+        return patient and metrics["summary"].get("ended") is not None
+
+    def run(self) -> None:
+        """Train, or go on with what is there. ``training.log`` in the folder takes what the recipe prints."""
+        if self.finished():
+            return
+        config = dataclasses.replace(self.asked(), resume=(self.folder / FILE).is_file())
+        self.folder.mkdir(parents=True, exist_ok=True)
+        log = (self.folder / "training.log").open("a", encoding="utf-8")
+        with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+            print(shlex.join([str(self.recipe), *EVERY, *self.words, "--seed", str(self.seed)]), flush=True)
+            load_recipe(self.recipe).main(config)
+        if self.finished():
+            return
+        if read_json(self.folder / "metrics.json") is None:
+            raise RuntimeError("the recipe has ended without results; see training.log")
+        raise KeyboardInterrupt  # the run has taken the signal, and kept its episodes
 
 
-def yardstick_tasks(config: Config, plant: str) -> list[Task]:
-    """Tasks that compute the yardsticks of a plant, its limit, and its line of costs if it has one."""
-    line = config.line(plant)
-    return [*config.yardsticks(plant).values(), *config.limits(plant).values(), *([line] if line else [])]
+@dataclass(frozen=True)
+class Yardstick:
+    """A cost that does not depend on the training, kept as JSON with what it depends on.
+
+    Args:
+        kind: optimum, or limit.
+        recipe: file of the recipe.
+        words: options of the recipe.
+        effort: how thoroughly it is sought.
+        place: folder of the files.
+    """
+
+    kind: str
+    recipe: Path
+    words: tuple[str, ...]
+    effort: dict[str, int]
+    place: Path
+
+    def of(self) -> dict[str, Any]:
+        """What the cost depends on: the options that this recipe alone has, those of the policy, and the effort."""
+        config = options_of(self.recipe, self.words).effective()
+        general = {field.name for field in dataclasses.fields(RunConfig)} - {"policy", "hidden", "unseen"}
+        options = {name: value for name, value in as_written(config).items() if name not in general}
+        worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes}
+        return {"kind": self.kind, "recipe": self.recipe.stem, "effort": self.effort, **options, **worn}
+
+    @functools.cached_property
+    def path(self) -> Path:
+        """The file."""
+        digest = hashlib.sha256(json.dumps(self.of(), sort_keys=True).encode()).hexdigest()
+        return self.place / f"{self.recipe.stem}-{self.kind}-{digest[:12]}.json"
+
+    def kept(self) -> dict[str, Any] | None:
+        """What is kept, or None."""
+        return read_json(self.path)
+
+    def finished(self) -> bool:
+        """Whether the cost is kept."""
+        return self.kept() is not None
+
+    def run(self) -> None:
+        """Compute the cost, unless it is kept."""
+        if self.finished():
+            return
+        if self.path.exists():
+            warnings.warn(f"{self.path} is damaged; it is computed again.", stacklevel=2)
+        torch.set_num_threads(1)
+        config = options_of(self.recipe, self.words).effective()
+        plant, physics = plant_of(config), physics_of(config)
+        episodes = UnseenEpisodes(plant, config.unseen)
+        episodes.physics = physics
+        if (wear := config.wear(plant)) is not None:
+            episodes.closure = wear(config.episodes - 1)
+        costs = self._costs(config, episodes, functools.partial(config.make_policy, physics))
+        self.place.mkdir(parents=True, exist_ok=True)
+        write_results(self.path, {"of": self.of(), **costs})
+
+    def _costs(self, config: RunConfig, episodes: UnseenEpisodes, make_policy: Callable) -> dict[str, Any]:
+        if self.kind == "optimum":
+            effort = (FOR_PERCEPTRONS if config.policy == "mlp" else {}) | self.effort
+            best = exact_optimum(episodes, make_policy, **effort)
+            return {"J_a": best.cost, "J_a_of_each_start": best.costs}
+        if (known := config.limit()) is None:
+            raise ValueError(f"recipe={self.recipe} does not say how the limit is computed; override Config.limit().")
+        few = episodes.first(self.effort["count"])
+        best = limit(few, few_starts(few, known), hold=known.hold, config=known.descent)
+        return {"J_a": best.mean, "costs": best.costs, "details": best.details}
 
 
-def entries_of(config: Config, plant: str) -> list[Entry]:
-    """Entries of a plant: arms, then classical controllers, then the oracle."""
-    trainings = config.trainings(plant)
-    found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *policies_of(plant, quick=config.quick))]
-    yardsticks = [yardstick_entry(name, task.run()) for name, task in config.yardsticks(plant).items()]
-    return found + yardsticks[1:] + yardsticks[:1]
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The object in a JSON file; None if the file is missing or damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
 
 
-def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
-    """Entries of every arm under every variant; the model error has the classical controllers too."""
-    every = config.trainings(plant)
-    found = {variant: [arm_entry(arm, every[variant, arm]) for arm in ARMS] for variant in config.variants()}
-    if CHANGED in found:
-        tasks = {name: config.yardsticks(plant)[name] for name in CONTROLLERS[plant]}
-        found[CHANGED] += [yardstick_entry(name, task.run()["changed"]) for name, task in tasks.items()]
-    return found
+def in_a_worker(file: str, kind: str, task: dict[str, Any]) -> str | None:
+    """Run a task of this file in another process, which imports the file: what a script defines has no name there."""
+    from rt_torchrl.runs.settings import module_of
+
+    study = module_of(Path(file))
+    return study.failure_of(getattr(study, kind)(**task))
 
 
-def gather(config: Config) -> Results:
-    """Gather the results of the study."""
-    results = Results({}, {}, {}, {})
-    for plant in config.chosen():
-        nominal = config.trainings(plant)["nominal", "twinning"]
-        results.entries[plant], results.variants[plant] = entries_of(config, plant), harder_of(config, plant)
-        results.limits[plant] = [yardstick_entry(name, task.run()) for name, task in config.limits(plant).items()]
-        results.summaries[plant] = [training.metrics()["summary"] for training in nominal]
-    return results
+def failure_of(task: Training | Yardstick) -> str | None:
+    """Run a task and return what went wrong; ``interrupted`` after Ctrl-C."""
+    try:
+        task.run()
+    except (Interrupted, KeyboardInterrupt):
+        return "interrupted"
+    except (Exception, SystemExit) as error:
+        return f"{getattr(task, 'folder', task.words)}: {type(error).__name__}: {error}"
+    return None
 
 
-def write(config: Config) -> Path:
-    """Write the tables, the figures and ``study.json``; return the path of the tables."""
-    from rt_torchrl.study.figures import draw  # here, because --help need not wait for Matplotlib
-    from rt_torchrl.study.page import write as write_page
+def run_all(tasks: Sequence[Training | Yardstick], *, jobs: int = 0, backend: str = "loky") -> list[str]:
+    """Run tasks side by side, with one progress line; one that fails stops no other.
 
-    results = gather(config)
-    figures = draw(config.report, results, {plant: line for plant in config.chosen() if (line := config.line(plant))})
-    made = {"quick": config.quick, "command": command(config), "unknown": config.beside()}
-    return write_page(config.report, results, figures=figures, **made)
+    Args:
+        tasks: the tasks; those that are finished are left as they are.
+        jobs: number of processes; 0 for one on each core.
+        backend: backend of joblib.
+
+    Returns:
+        What went wrong.
+
+    Raises:
+        ValueError: before any work, if a folder holds a run of other options, or Ray is missing.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM.
+    """
+    from joblib import Parallel, delayed  # here, because --help needs none of it
+    from tqdm import tqdm
+
+    if backend == "ray":
+        register_ray()
+    missing, failures = [task for task in tasks if not task.finished()], []
+    if not missing:
+        return []
+    returned = "list" if backend == "ray" else "generator_unordered"
+    workers = Parallel(n_jobs=jobs or -1, backend=backend, batch_size=1, return_as=returned)
+    calls = [delayed(in_a_worker)(__file__, type(task).__name__, vars_of(task)) for task in missing]
+    with termination_as_interrupt(), tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc="study") as bar:
+        try:
+            for failure in workers(calls):
+                if failure == "interrupted":
+                    raise KeyboardInterrupt
+                failures += [failure] if failure else []
+                bar.update()
+        except KeyboardInterrupt:
+            bar.write(f"interrupted: {bar.n} of {len(tasks)} are finished; the same command goes on")
+            raise
+    return failures
 
 
-def command(config: Config) -> str:
-    """The command line that makes these tables."""
-    plants = " ".join([*config.plants, *(("--unknown", *config.unknown) if config.unknown else ())])
-    size = f"--seeds {config.seeds} --variant-seeds {config.variant_seeds} --unseen {config.unseen}"
-    limits = "" if config.limit_episodes == 8 else f" --limit-episodes {config.limit_episodes}"
-    return f"uv run recipes/study.py --plants {plants} {'--quick' if config.quick else size}{limits}"
+def vars_of(task: Training | Yardstick) -> dict[str, Any]:
+    """The arguments that make a task."""
+    return {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+
+
+def register_ray() -> None:
+    """Make Ray a backend of joblib.
+
+    Raises:
+        ValueError: if Ray is missing.
+    """
+    try:
+        from ray.util.joblib import register_ray as register
+    except ImportError as error:
+        raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[cluster]'.") from error
+    register()
+
+
+def overview(comparisons: Sequence[Comparison], key: str) -> str:
+    """Ratios of every arm to the first one by system, and their geometric mean over the systems, as Markdown."""
+    first = comparisons[0].rows[0].name
+    numbers = {one.title: one.numbers()["rows"] for one in comparisons if one.rows[0].name == first}
+    arms = list(dict.fromkeys(arm for rows in numbers.values() for arm in rows))[1:]
+    lines = [[system, *(with_interval(rows.get(arm, {}).get(key)) for arm in arms)] for system, rows in numbers.items()]
+    ratios = [[rows[arm][key]["ratio"] for rows in numbers.values() if rows.get(arm, {}).get(key)] for arm in arms]
+    means = [f"{statistics.geometric_mean(each):.3f} ({len(each)})" if each else "" for each in ratios]
+    return markdown(["", *arms], [*lines, ["geometric mean (systems)", *means]])
+
+
+def write(config: Config, comparisons: Sequence[Comparison]) -> str:
+    """Write study.md, study.json and study.png, and return the text."""
+    from rt_torchrl.figures import save_figure
+    from rt_torchrl.runs.compare import comparison_figure
+
+    parts = []
+    if max(len(comparison.rows) for comparison in comparisons) > 1:
+        first = comparisons[0].rows[0].name
+        parts += [f"## J_a at the end over that of {first}", overview(comparisons, "J_a_ratio")]
+        parts += [f"## Σ J_a of the real episodes over that of {first}", overview(comparisons, "paid_ratio")]
+    for comparison in comparisons:
+        parts += [f"## {comparison.title}", comparison.table()]
+    text = "\n\n".join(parts) + "\n"
+    (config.log_dir / "study.md").write_text(text, encoding="utf-8")
+    systems = {comparison.title: comparison.numbers() for comparison in comparisons}
+    write_results(config.log_dir / "study.json", {"config": config, "systems": systems})
+    figure = comparison_figure(comparisons, "$J_a$ of the live policy; line: median of the seeds, band: their range")
+    save_figure(figure, config.log_dir / "study.png")
+    return text
+
+
+def studied(config: Config) -> tuple[list[Comparison], list[str]]:
+    """Train what is missing; return the comparison of each system, and what went wrong."""
+    trainings, pool = config.trainings(), {"jobs": config.jobs, "backend": config.backend}
+    failures = run_all([training for group in trainings.values() for training in group], **pool)
+    yardsticks = {key: {} for key in trainings}
+    for key, group in trainings.items():
+        places = {FinishedRun.read(training.folder).place for training in group if training.finished()}
+        # Of a real system that nobody simulates, no gradients are known.
+        if places == {"simulation"} and isinstance(group[0].asked(), MakesPlant):
+            yardsticks[key] = config.yardsticks(group[0])
+    distinct = {yardstick.path: yardstick for group in yardsticks.values() for yardstick in group.values()}
+    failures += run_all(list(distinct.values()), **pool)
+    return comparisons_of(trainings, yardsticks), failures
+
+
+def comparisons_of(
+    trainings: "dict[tuple[str, str], list[Training]]", yardsticks: "dict[tuple[str, str], dict[str, Yardstick]]"
+) -> list[Comparison]:
+    """The finished runs of each system by arm, beside their yardsticks.
+
+    The optimum of a class of policies is the least cost that anybody has found: the search by gradients, or a run.
+    """
+    finished = {
+        key: [FinishedRun.read(training.folder) for training in group if training.finished()]
+        for key, group in trainings.items()
+    }
+    least: dict[Path, float] = {}
+    for key, runs in finished.items():
+        if runs and "optimum" in yardsticks[key] and (kept := yardsticks[key]["optimum"].kept()):
+            path, sought = yardsticks[key]["optimum"].path, math.inf if kept["J_a"] is None else kept["J_a"]
+            least[path] = min(least.get(path, sought), *(run.cost for run in runs))
+    rows: dict[str, list[Row]] = {}
+    for (system, arm), runs in finished.items():
+        of = yardsticks[system, arm]
+        optimum = least.get(of["optimum"].path) if "optimum" in of else None
+        limit = (of["limit"].kept() or {}).get("costs") if "limit" in of else None
+        if runs:
+            rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum, limit=limit))
+    return [Comparison(system, of_system) for system, of_system in rows.items()]
 
 
 def main(config: Config) -> None:
-    if config.unknown and config.variant_seeds:
-        print(f"{CHANGED} is left out: with it the real systems are others than with --unknown.", flush=True)
-    compute(config)
-    print(f"tables in {write(config)}")
+    make_folder("log_dir", config.log_dir)
+    comparisons, failures = ([compare_runs(config.runs)], []) if config.runs else studied(config)
+    if comparisons:
+        print(write(config, comparisons))
+        print(f"study.md, study.json and study.png in {config.log_dir}")
+    if failures:
+        raise ValueError("\n".join([f"{len(failures)} failed, the others are kept:", *failures]))
 
 
 if __name__ == "__main__":

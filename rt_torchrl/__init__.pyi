@@ -71,6 +71,7 @@ from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Star
 from .interruption import require_finished
 from .loading import begin_loading
 from .options import configuration
+from .runs.compare import Comparison, compare_runs
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run
 from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
@@ -92,6 +93,7 @@ __all__ = [
     "CallingSimulator",
     "Clairvoyant",
     "ClassicalController",
+    "Comparison",
     "ConnectedPlant",
     "ConstraintsConfig",
     "ContractReport",
@@ -200,6 +202,7 @@ __all__ = [
     "check_plant",
     "check_real_system",
     "clairvoyant",
+    "compare_runs",
     "configuration",
     "control_cost",
     "export_c",

@@ -15,6 +15,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.interact import ShortTermMemory
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -291,3 +292,12 @@ def test_keys_flow_as_the_steps_declare():
     assert record["states"].shape == (n + 1, 2) and record["actions"].shape == record["exogenous"].shape == (n, 1)
     assert len(episode["transitions", "0"]) == n and episode["large_scale"].shape == (n, 1)
     assert set(found.in_keys) == {"number", "live"}
+
+
+def test_short_term_memory_keeps_the_last_episodes_in_order():
+    memory = ShortTermMemory(2)
+    for record in "abc":
+        memory.append(record)
+    assert list(memory) == ["b", "c"]
+    with pytest.raises(ValueError, match="capacity=0"):
+        ShortTermMemory(0)

@@ -23,9 +23,7 @@ BUILD = "uv run --group docs sphinx-build -W --keep-going docs docs/_build"
 
 def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
-    if name == "unknown":
-        return ["flapping_wing", *arguments]
-    if name in ("compare", "export"):
+    if name == "export":
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -120,7 +118,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run docs/quadrotor.py", "uv run docs/heated_room.py"}  # tests/test_documentation.py
-    known |= {"uv run tests/ruler.py"}  # tests/test_study.py
+    known |= {"uv run tests/ruler.py"}  # tests/test_results.py
     known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
     known |= {f"{PYTEST} -m faults", "uv run --group test --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
     assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
@@ -185,6 +183,6 @@ def direct_of(extra, extras):
 
 def test_one_word_for_the_folder_of_the_results():
     """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "compare", "export", "paper", "record_log"}
+    without = {"benchmark", "export", "paper", "record_log"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

@@ -183,9 +183,7 @@ def test_the_hooks_are_installed(clone):
     assert (clone / ".git" / "hooks" / "pre-commit").exists()
 
 
-@pytest.mark.parametrize(
-    "command", [command for command in commands() if re.search(r"recipes/(study|unknown).py", command)]
-)
+@pytest.mark.parametrize("command", [command for command in commands() if "recipes/study.py" in command])
 def test_a_printed_study_begins(command, clone, monkeypatch):
     """Up to its plan of tasks; the tests of the study run some."""
-    require_begun_here(command, clone, monkeypatch, "side_by_side" if "study.py" in command else "on_this_machine")
+    require_begun_here(command, clone, monkeypatch, "compare_runs" if "--runs" in command else "run_all")

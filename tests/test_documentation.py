@@ -112,10 +112,26 @@ def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
 
 def test_the_callback_of_the_documentation_ends_a_training():
     scope = {}
-    exec(compile("\n".join(blocks("habits.md", "python")), "docs/habits.md", "exec"), scope)
+    exec(compile(blocks("habits.md", "python")[0], "docs/habits.md", "exec"), scope)
     said = scope["cheap_enough"]
     assert said([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
     assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
+
+
+@pytest.mark.slow
+def test_the_search_of_the_documentation_runs(tmp_path, monkeypatch):
+    """As printed, with a single trial; the same code goes on with the search."""
+    pytest.importorskip("optuna", reason="a search needs the extra sweep")
+    monkeypatch.chdir(tmp_path)
+    code, scope = blocks("habits.md", "python")[1].replace("n_trials=10", "n_trials=1"), {}
+    for done in (1, 2):
+        exec(compile(code, "docs/habits.md", "exec"), scope)
+        assert len(scope["search"].trials) == done
+    costs = [
+        json.loads(Path(f"runs/search/0-{seed}/metrics.json").read_text())["summary"]["unseen"]["J_a_model_based"]
+        for seed in (0, 1)
+    ]
+    assert scope["search"].trials[0].value == pytest.approx(sum(cost["mean"] for cost in costs) / 2.0)
 
 
 @pytest.mark.slow

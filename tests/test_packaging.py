@@ -138,25 +138,17 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
-    "accuracy.py": {"evaluation", "runs", "study", "trajectories", "steps"},
-    "asynchronous.py": {"runs"},
     "benchmark.py": {"runs", "trajectories"},
     "cascaded_tanks.py": {"figures", "fit", "runs"},
-    "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
     "gallery.py": {"runs"},
     "identify.py": {"fit", "figures", "runs"},
-    "limit.py": {"evaluation", "control", "runs", "study"},
-    "memory.py": {"evaluation", "figures", "runs"},
+    "limit.py": {"evaluation", "control", "runs"},
     "paper.py": {"optimisers", "runs", "steps", "systems"},
-    "paper_figures.py": {"figures", "steps", "study"},
-    "pareto.py": {"runs", "study"},
-    "partial.py": {"runs", "study"},
+    "paper_figures.py": {"figures", "steps"},
     "record_log.py": {"fit", "runs"},
     "served_turbine.py": {"runs", "systems"},
-    "study.py": {"study", "runs"},
-    "sweep.py": {"figures", "runs", "study"},
-    "unknown.py": {"study", "runs"},
+    "study.py": {"atomic_file", "evaluation", "figures", "interruption", "options", "runs", "steps"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""
 
@@ -249,7 +241,7 @@ def test_it_lists_every_recipe_with_its_purpose(monkeypatch, capsys):
     console.main(["--help"])
     assert capsys.readouterr().out == bare and max(map(len, bare.splitlines())) <= 80
     listed = {line.split()[0] for line in bare.splitlines() if line.startswith("  ") and line[2] != " "}
-    assert listed == RECIPES | {"FILE.py"} and "Finished runs side by side" in bare
+    assert listed == RECIPES | {"FILE.py"} and "Arms of the algorithm on several systems" in bare
 
 
 def test_the_list_waits_for_no_library():

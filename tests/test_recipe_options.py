@@ -70,6 +70,14 @@ def test_options_out_of_range_are_refused(plant, options, message):
         made(plant, **options)
 
 
+def test_weights_of_another_task_are_refused():
+    made = recipe("wind_turbine")
+    weights = made.EngineeringCost(pitch_rate=0.1)
+    assert made.Config(task="engineering", engineering=weights).plant().cost == weights
+    with pytest.raises(ValueError, match="weights of the task engineering"):
+        made.Config(engineering=weights)
+
+
 def test_wind_that_no_turbine_has_met_is_refused(tmp_path):
     file = tmp_path / "storm.hh"
     file.write_text(HEADER + "".join(LINE.format(time=0.5 * k, speed=1e42 if k == 7 else 11.0) for k in range(1300)))

@@ -8,11 +8,10 @@ import re
 
 import pytest
 import torch
-from handwritten_study import recipe
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from small_runs import SMALL
-from test_export_recipe import leave_run
+from test_export_recipe import leave_run, recipe
 from test_optimal_control import quadratic_program
 
 from rt_torchrl import load_run

@@ -5,7 +5,10 @@ import dataclasses
 import json
 import math
 import struct
+import subprocess
+import sys
 import time
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -433,3 +436,22 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
     record |= {f"rms/{name}": value for name, value in rms.items()}
     assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
+
+
+RULER = Path(__file__).parent / "ruler.py"
+
+
+def ruled(folder, model_based, model_free, paid):
+    folder.mkdir(parents=True)
+    unseen = {"J_a_model_based": {"mean": model_based}, "J_a_model_free": {"mean": model_free}}
+    metrics = {"summary": {"live": "model_free", "unseen": unseen}, "episodes": [{"real_cost": cost} for cost in paid]}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    (folder / "seconds.json").write_text("12.0")
+
+
+def test_a_row_has_ranges_and_counts_trainings_whose_dearer_policy_is_live(tmp_path):
+    ruled(tmp_path / "turbine-pitch" / "0", 1.0, 1.25, [2.0, 3.0])
+    ruled(tmp_path / "turbine-pitch" / "1", 1.5, 1.5, [4.0, 4.0])
+    command = [sys.executable, str(RULER), "--seeds", "2", "--folder", str(tmp_path), "--rows", "turbine, pitch"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "| turbine, pitch | 2 | 1.25 … 1.5 | 1 … 1.5 | 1 | 5 … 8 | 12 |"

@@ -398,31 +398,11 @@ def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
     assert results["intervals"] == 40.0 and results["lost_connections"] == 0.0 and results["J_a"] > 0.0
 
 
-@pytest.mark.nightly
-def test_trainings_of_the_same_real_time_are_compared(tmp_path):
-    module = recipe("asynchronous")
-    options = {"hours": 0.05, "horizon": 60.0, "seeds": (0,), "quick": True, "pace": 10.0}
-    module.main(module.Config(log_dir=tmp_path, **options))
-    (found,) = json.loads((tmp_path / "asynchronous.json").read_text())["seeds"]
-    assert found["synchronous"] > 0.0 and found["asynchronous"] > 0.0 and found["learning_share"] > 0.0
-
-
-def test_costs_are_summed_over_the_real_time_alone():
-    """Two hours: an hour and a half of episodes, half an hour of waiting between, and what comes later is left out."""
-    module = recipe("asynchronous")
-    config = module.Config(hours=2.0, horizon=1800.0)
-    found = module.course([1.0, 2.0, 3.0, 9.0], [1.0] * 4, [1800.0, 0.0, 0.0, 0.0], 5.0, config)
-    assert found == 1800.0 * (1.0 + 5.0 + 2.0 + 3.0) / 2.0
-
-
 @pytest.mark.parametrize(
     ("name", "option", "value"),
     [
         ("served_turbine", "pace", 0.0),
         ("served_turbine", "port", 0),
-        ("asynchronous", "pace", -1.0),
-        ("asynchronous", "hours", 0.1),
-        ("asynchronous", "seeds", ()),
     ],
 )
 def test_impossible_options_are_refused(name, option, value):

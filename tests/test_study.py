@@ -1,466 +1,335 @@
-"""The study from results by hand: its plan, tables, figures and numbers, and finished runs side by side."""
+"""Finished runs beside each other, and the study that makes them: numbers by hand, and small trainings."""
 
 import json
-import subprocess
+import math
+import os
+import signal
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from handwritten_study import EPISODES, finish, finished, recipe, results
+import study
+from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
+from scipy.optimize import minimize
 
-from rt_torchrl.atomic_file import finite
-from rt_torchrl.study import figures as charts
-from rt_torchrl.study import page, tables
-from rt_torchrl.study.bootstrap import mean_interval
-from rt_torchrl.study.comparison import comparison_figure, comparison_table, entries_of
-from rt_torchrl.study.results import Entry, arm_entry, difference, weight_error
-from rt_torchrl.study.tables import difference_table, paper_table
-from rt_torchrl.study.training import VARIANTS, Training
+from rt_torchrl import Comparison, compare_runs
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.runs.compare import FinishedRun, Row, comparison_figure, paired_ratio
+from rt_torchrl.steps.interact import Interact
 
-
-def test_a_plant_that_does_not_exist_is_refused():
-    config = recipe("study").Config
-    with pytest.raises(ValueError, match="must be all, or some of wind_turbine, flapping_wing, cryogenic_tank"):
-        config(plants=("moon",))
-    assert config(plants=("all",)).chosen() == ["wind_turbine", "flapping_wing", "cryogenic_tank"]
+TINY = Path(__file__).with_name("small_recipe.py")
+NAN = None  # in the place of what is not finite
 
 
-def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
-    study = recipe("study")
-    batches = study.short_batches(study.Config(quick=True, folder=tmp_path))
-    plants_of = [{task.plant for task in batch if isinstance(task, Training)} for batch in batches]
-    # The turbine's oracle shares no graph with its trainings, the gain-scheduled policy none with the other ones.
-    assert plants_of == [{"cryogenic_tank"}, {"flapping_wing"}, {"wind_turbine"}, {"wind_turbine"}, set()]
-    (alone,) = batches[3]
-    assert alone.options[-2:] == ("--policy", "scheduled")
-    assert [task.path.stem for task in batches[4]] == ["oracle", "Jonkman", "limit-2", "mpc-2"]
-    planned = [task for batch in batches for task in batch]
-    assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
-
-
-def test_the_limit_and_predictive_control_can_be_left_out(tmp_path):
-    config = recipe("study").Config
-    plants = ("wind_turbine", "flapping_wing", "cryogenic_tank")
-    asked = {plant: list(config(folder=tmp_path).limits(plant)) for plant in plants}
-    # Gradients find no plans of the tank's half-open valve.
-    assert asked == {"wind_turbine": ["limit", "mpc"], "flapping_wing": ["limit", "mpc"], "cryogenic_tank": ["limit"]}
-    assert all(config(folder=tmp_path, limit_episodes=0).limits(plant) == {} for plant in plants)
-    few = config(folder=tmp_path, limit_episodes=3)
-    assert few.limits("wind_turbine")["mpc"].path.name == "mpc-3.json"  # other results than those on 8 episodes
-    assert "--limit-episodes 3" in recipe("study").command(few)
-    for impossible in (1, 101, -1):
-        with pytest.raises(ValueError, match=f"limit_episodes={impossible} must be 0, or from 2 to unseen=100"):
-            config(limit_episodes=impossible)
-
-
-def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
-    config = recipe("study").Config(seeds=3, variant_seeds=2, folder=tmp_path)
-    groups = config.trainings("flapping_wing")
-    assert {key: len(group) for key, group in groups.items() if key[0] == "nominal"} == {
-        ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based", "twinning, perceptron")
-    }
-    arms = ("twinning", "model_free", "model_based")
-    assert [key for key in groups if key[0] != "nominal"] == [(v, a) for v in VARIANTS if v != "nominal" for a in arms]
-    assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
-    folders = {t.folder for group in groups.values() for t in group}
-    assert len(folders) == 3 * 4 + 4 * 3 * 2
-    policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
-    assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
-    (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]
-    assert first.arm == "twinning" and first.command().endswith("--policy scheduled")
-    short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
-    assert list(dict.fromkeys(variant for variant, _ in short)) == ["nominal", "noise 5 %", "model error"]
-    # What is kept of a quick study is never taken for a result of the whole one.
-    assert folders.isdisjoint(t.folder for group in short.values() for t in group)
-
-
-ALL = ("wind_turbine", "flapping_wing", "cryogenic_tank")
-
-
-def test_names_of_unknown_systems_belong_to_the_plants_that_have_them():
-    config = recipe("study").Config
-    assert config().beside() == dict.fromkeys(ALL, ())
-    found = config(unknown=("valve_lag", "gust", "inflow", "pitch", "bias_5")).beside()
-    assert found == dict(zip(ALL, (("inflow", "pitch"), ("gust",), ("bias_5", "valve_lag")), strict=True))
-
-
-def test_names_that_a_plant_of_the_study_does_not_have_are_refused():
-    config = recipe("study").Config
-    with pytest.raises(
-        ValueError, match=r"none of them is on wind_turbine, flapping_wing\. Name the plants .*--plants"
-    ):
-        config(unknown=("bias_15",))
-    with pytest.raises(ValueError, match="moon is on none of these plants; choose cryogenic_tank: bias_5, bias_15"):
-        config(unknown=("bias_15", "moon"), plants=("cryogenic_tank",))
-    with pytest.raises(ValueError, match="pitch is on none of these plants"):  # another plant has it
-        config(unknown=("bias_15", "pitch"), plants=("cryogenic_tank",))
-    with pytest.raises(ValueError, match="bias_5 and bias_15 both change the pressure sensor"):
-        config(unknown=("bias_5", "bias_15"), plants=("cryogenic_tank",))
-
-
-def test_everything_of_a_study_is_made_on_the_real_system_that_it_names(tmp_path):
-    study = recipe("study")
-    common = {"plants": ("cryogenic_tank",), "folder": tmp_path}
-    nominal, config = study.Config(**common), study.Config(unknown=("valve_lag", "bias_15"), **common)
-    trainings = [task for task in study.ordered_tasks(config) if isinstance(task, Training)]
-    assert all("--unknown bias_15 valve_lag" in training.command() for training in trainings)
-    yardsticks = [task for task in study.ordered_tasks(config) if not isinstance(task, Training)]
-    assert len(yardsticks) == 5
-    assert all("bias_15" in str(task.compute.args) and "valve_lag" in str(task.compute.args) for task in yardsticks)
-    # Model error would be another real system.
-    assert config.variants() == ["noise 0.5 %", "noise 1 %", "noise 5 %"]
-    assert nominal.variants() == [*config.variants(), "model error"]
-    assert study.command(config).startswith(
-        "uv run recipes/study.py --plants cryogenic_tank --unknown valve_lag bias_15 "
-    )
-    # The same names in another order are the same system; nothing else shares a folder with it.
-    again = study.Config(unknown=("bias_15", "valve_lag"), **common)
-    others = [nominal, study.Config(unknown=("bias_15",), **common), study.Config(quick=True, **common)]
-    assert places(again) == places(config)
-    assert all(places(other).isdisjoint(places(config)) for other in others)
-
-
-def places(config):
-    """Where a study keeps its report and results."""
-    tasks = recipe("study").ordered_tasks(config)
-    return {config.report, *(task.folder if isinstance(task, Training) else task.path for task in tasks)}
-
-
-def test_a_report_is_written_of_a_system_that_its_twin_does_not_know(tmp_path):
-    """Of the turbine without the limit, because its report has no line of costs: nothing is computed."""
-    study = recipe("study")
-    config = study.Config(plants=("wind_turbine",), unknown=("pitch",), quick=True, limit_episodes=0, folder=tmp_path)
-    groups = config.trainings("wind_turbine")
-    for training in (training for group in groups.values() for training in group):
-        finish(training)
-    for task in study.yardstick_tasks(config, "wind_turbine"):
-        task.path.parent.mkdir(parents=True, exist_ok=True)
-        task.path.write_text(json.dumps({"costs": [1.1] * EPISODES, "merit": {"m [m]": {"mean": 1.0}}}))
-    page = study.write(config)
-    assert page.parent == tmp_path / "quick" / "unknown" / "pitch"
-    text = (page.parent / "README.md").read_text()
-    assert "## Wind turbine with pitch" in text and "| noise 5 % | twinning |" in text
-    assert "| model error |" not in text and "following.png" not in text
-    assert "beside the paper" not in text  # whose table is of the plants as their twins know them
-    assert json.loads((page.parent / "study.json").read_text())["wind_turbine"]["unknown"] == ["pitch"]
-
-
-def test_the_report_is_written_from_what_is_kept(tmp_path):
-    """A whole quick study of the drone from results written by hand: nothing is computed."""
-    study = recipe("study")
-    config = study.Config(plants=("flapping_wing",), quick=True, folder=tmp_path)
-    groups = config.trainings("flapping_wing")
-    for training in (training for group in groups.values() for training in group):
-        finish(training)
-    judged = {"costs": [1.1] * EPISODES, "merit": {"m [m]": {"mean": 1.0}}}
-    line = {"name": "episodes planned on", "unit": "-", "values": [2, 5], "costs": [1.2, 1.1]}
-    for task in study.yardstick_tasks(config, "flapping_wing"):
-        task.path.parent.mkdir(parents=True, exist_ok=True)
-        task.path.write_text(json.dumps(line if task.path.stem == "episode-line" else judged | {"changed": judged}))
-    assert all(task.done() for task in study.ordered_tasks(config))
-    page = study.write(config)
-    text = (page.parent / "README.md").read_text()
-    study_figures = ["learning", "robustness", "limits", "variants", "following", "flapping_wing_episode-line"]
-    shown = [part.split(")")[0] for part in text.split("](figures/")[1:]]
-    assert shown == [f"{name}.png" for name in study_figures]
-    assert all((page.parent / "figures" / name).exists() for name in shown)
-    names = ("twinning", "twinning, perceptron", "PD", "oracle", "limit", "mpc")
-    assert all(f"| {name} |" in text for name in names)
-    assert "--quick" in text
-    numbers = json.loads((page.parent / "study.json").read_text())["flapping_wing"]
-    assert list(numbers["variants"]) == ["noise 5 %", "model error"]
-
-
-# The study's tables, figures and numbers, from results that are written by hand.
-
-
-def rows_of(text):
-    """Cells of each row of the Markdown tables in a text."""
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:2] == "| "]
-
-
-def test_the_page_has_tables_and_numbers(tmp_path):
-    figures = [Path("figures/a.png")]
-    source = page.write(tmp_path, results(tmp_path), figures=figures, quick=True, command="uv run x")
-    text = source.read_text()
-    assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "uv run x" in text and "![a](figures/a.png)" in text
-    harder = {tuple(row[:2]): row for row in rows_of(text)}
-    assert harder["noise 1 %", "twinning"][4] == "1.500" and harder["model error", "PD"][4] == "1.000"
-    numbers = json.loads((tmp_path / "study.json").read_text())["flapping_wing"]
-    assert numbers["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
-    assert numbers["variants"]["noise 1 %"]["twinning"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
-
-
-def test_differences_say_who_is_better(tmp_path):
-    found = results(tmp_path)
-    rows = rows_of(difference_table({"nominal": found.entries["flapping_wing"]} | found.variants["flapping_wing"]))
-    signs = {}
-    for variant, arm, other, interval in rows[2:]:
-        low, high = map(float, interval.split(" … "))
-        signs[variant, arm, other] = -1 if high < 0.0 else 1 if low > 0.0 else 0
-    assert signs["nominal", "twinning", "model free"] == -1 and signs["nominal", "twinning", "model based"] == 0
-    assert signs["nominal", "twinning", "PD"] == -1 and signs["nominal", "twinning, other", "PD"] == 1
-    assert signs["noise 1 %", "twinning", "model free"] == -1 and signs["noise 1 %", "twinning", "model based"] == 0
-    assert not any("oracle" in key for key in signs)
-
-
-def test_the_table_has_the_limit_and_predictive_control_on_the_first_episodes(tmp_path):
-    found = results(tmp_path)
-    text = page.write(tmp_path, found, figures=[], quick=False, command="x").read_text()
-    rows = {row[0]: row for row in reversed(rows_of(text))}
-    entries = {entry.name: entry for entry in found.entries["flapping_wing"]}
-    best = 0.5 * entries["twinning"].costs[0, :8].mean()
-    assert rows["limit"][4] == "1.000" and rows["mpc"][4] == "1.500"
-    assert rows["twinning"][4] == f"{entries['twinning'].costs[:, :8].mean() / best:.3f}"
-    assert rows["mpc"][3] == f"{1.5 * best / entries['oracle'].costs[:, :8].mean():.3f}"
-    assert "on the first 8 unseen episodes" in text and "3.25 ms in the median" in text
-    numbers = json.loads((tmp_path / "study.json").read_text())["flapping_wing"]
-    assert numbers["limits"]["mpc"]["milliseconds"] == 3.25 and numbers["limits"]["limit"]["episodes"] == 8
-    without = page.write(tmp_path, found._replace(limits={"flapping_wing": []}), figures=[], quick=False, command="x")
-    assert "limit" not in without.read_text()
-
-
-def test_the_figures_show_every_arm_and_yardstick(tmp_path):
-    found = results(tmp_path)
-    curves = charts.learning(found.entries)
-    texts = {text.get_text() for text in curves.legends[0].get_texts()}
-    assert texts == {"twinning", "model free", "model based", "twinning, other", "oracle", "classical"}
-    (line,) = [line for line in curves.axes[0].lines if line.get_label() == "twinning"]
-    assert np.allclose(line.get_ydata(), [5.0, 1.05, 1.0])
-    other = {"a": [found.entries["flapping_wing"][3]], "b": found.entries["flapping_wing"][::-1]}
-    drawn = [ax.lines for ax in charts.learning(other).axes]
-    colours = [{line.get_color() for line in lines if line.get_label() == "twinning, other"} for lines in drawn]
-    assert colours[0] == colours[1] and len(colours[0]) == 1
-    violins = charts.robustness(found.entries)
-    labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
-    assert labels == ["twinning", "model free", "model based", "twinning,\nother", "PD", "oracle"]
-    harder = charts.variants(found.entries, found.variants).axes[0]
-    assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %", "model error"]
-    points = [line for line in harder.lines if np.allclose(line.get_xdata(), 0.8)]
-    assert np.allclose([line.get_ydata() for line in points], 1.5, rtol=0.05) and len(points) == 1
-    line = {"name": "K_P", "unit": "-", "values": [1.0, 10.0], "costs": [2.0, 1.0]}
-    (axes,) = charts.cost_line(line, found.entries["flapping_wing"]).axes
-    assert [drawn.get_label() for drawn in axes.lines[1:]] == ["twinning", "PD", "oracle"]
-    assert np.allclose(axes.lines[1].get_ydata(), found.entries["flapping_wing"][0].mean)
-    following = charts.following(found.entries, found.variants).axes[0]
-    assert [line.get_label() for line in following.lines] == ["nominal", "model error"]
-    assert np.allclose(following.lines[1].get_ydata(), [0.05, 0.0105, 0.01])
-
-
-def test_a_figure_shows_how_far_from_the_limit_everything_is(tmp_path):
-    found = results(tmp_path)
-    (ax,) = charts.limits(found.entries, found.limits).axes
-    drawn = dict(zip([label.get_text() for label in ax.get_yticklabels()], ax.patches, strict=True))
-    twinning, best = found.entries["flapping_wing"][0], found.limits["flapping_wing"][0]
-    assert drawn["mpc"].get_width() == pytest.approx(1.5) and "limit" not in drawn
-    assert drawn["twinning"].get_width() == pytest.approx(twinning.costs[:, :8].mean() / best.costs.mean())
-    assert set(drawn) == {"mpc", *(entry.name.replace("_", " ") for entry in found.entries["flapping_wing"])}
-
-
-def test_tables_have_a_word_for_what_diverges(tmp_path):
-    """``metrics.json`` holds null for it."""
-    metrics = finished(tmp_path, 0, 0.0).metrics()
-    metrics["summary"]["unseen"]["J_a_model_free"]["mean"] = None
-    assert "| inf |" in paper_table({"flapping_wing": [metrics["summary"]]})
-
-
-def test_a_study_without_variants_has_no_section_of_them(tmp_path):
-    found = results(tmp_path)._replace(variants={"flapping_wing": {}}, limits={"flapping_wing": []})
-    source = page.write(tmp_path, found, figures=[], quick=False, command="uv run x")
-    assert "Sensor noise and model error" not in source.read_text()
-
-
-# Rows of the study and their intervals, from trainings that are written by hand.
-
-
-def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
-    entry = arm_entry("twinning", [finished(tmp_path, seed, 0.1 * seed) for seed in range(3)])
-    assert entry.costs.shape == (3, EPISODES)
-    assert entry.mean == pytest.approx(entry.costs.mean(1).mean())
-    assert entry.weight_error == pytest.approx([0.1] * 3) and entry.J_p_ratio == [1e-3] * 3
-    assert entry.episodes_to(1.0) == [2, 2, 2] and entry.episodes_to(0.5) == [None] * 3
-    assert entry.twin_errors == [pytest.approx([0.05, 0.0105, 0.01])] * 3
-    low, high = entry.interval()
-    assert low < entry.mean < high
-
-
-def test_an_unseen_episode_that_diverges_costs_infinitely(tmp_path):
-    """``metrics.json`` holds null there; the study must not fail, and the mean must not pass it over."""
-    found = [finished(tmp_path, seed, 0.1 * seed) for seed in range(2)]
-    metrics = found[1].metrics()
-    live = metrics["summary"]["live"]
-    metrics["summary"]["unseen"]["costs"][live][3] = None
-    for values in metrics["summary"]["unseen"]["merit"][live].values():
-        values["mean"] = None
-    (found[1].folder / "metrics.json").write_text(json.dumps(metrics))
-    entry = arm_entry("twinning", found)
-    assert np.isposinf(entry.mean) and np.isfinite(entry.costs[0]).all()
-    assert all(np.isnan(value) for value in entry.merit.values())
-    low, high = entry.interval()
-    assert np.isposinf(high) and not np.isnan(low)
-    assert tables.cost_cells(entry)[0] == "inf"
-
-
-def test_intervals_cover_the_mean_as_often_as_they_say():
-    rng, hits = np.random.default_rng(0), 0
-    for _ in range(40):
-        low, high = mean_interval(rng.standard_normal((1, 60)))
-        hits += low < 0.0 < high
-    # 95 % of 40 is 38; fewer than 33 has a probability of 1e-3.
-    assert hits >= 33
-
-
-def test_differences_are_paired_by_episode():
-    rng = np.random.default_rng(0)
-    hard = 10.0 * rng.random((1, 50))
-    first, second = (Entry(name=name, costs=hard + shift, merit={}) for name, shift in (("a", 0.1), ("b", 0.0)))
-    # Episodes differ by ten, the controllers by a tenth in each.
-    assert difference(first, second) == pytest.approx((0.1, 0.1))
-    with pytest.raises(ValueError, match="a was judged on 50 unseen episodes, c on 3"):
-        difference(first, Entry(name="c", costs=np.ones((1, 3)), merit={}))
-
-
-def test_a_closure_of_another_kind_has_no_weight_error():
-    assert weight_error({"found": {"a": 1.0}, "true": {"c1": 2.0}}) is None
-    assert weight_error({"found": {"a": 1.0}, "true": None}) is None
-
-
-def test_weights_that_the_real_system_has_beside_those_of_the_closure_count_for_nothing():
-    """Such as the offset of a sensor, of which the plant's own closure knows nothing."""
-    assert weight_error({"found": {"a": 1.1}, "true": {"a": 1.0, "pressure_offset": 15e3}}) == pytest.approx(0.1)
-
-
-def test_a_twin_that_diverges_has_an_infinite_error(tmp_path):
-    """Its J_p is null in the metrics, and in the numbers of the study."""
-    found = finished(tmp_path, 0, 0.0)
-    metrics = found.metrics()
-    metrics["episodes"][-1]["J_p"] = None
-    (found.folder / "metrics.json").write_text(json.dumps(metrics))
-    entry = arm_entry("twinning", [found])
-    assert entry.twin_errors[0][-1] == float("inf") and entry.twin_errors[0][0] == pytest.approx(0.05)
-    assert finite(page.numbers_of(entry))["J_p"][0][-1] is None
-
-
-# Finished runs side by side.
-
-
-KINDS = {"model_based": 1.0, "model_free": 3.0}
-
-
-def leave(folder, *, arm, seed, costs, plant="tanks", hidden=(16,)):
+def leave(folder, *, seed, costs, curve=(4.0, 2.0), arm="twinning", plant="tanks", valve=2.0, **settings):
     """The files of a finished run that a comparison reads."""
-    folder.mkdir()
-    settings = {"plant": plant, "recipe": {}, "seed": seed, "hidden": hidden, "twinning": {"arm": arm}, "ran": [seed]}
-    (folder / "config.json").write_text(json.dumps(settings))
+    folder.mkdir(parents=True)
+    options = {"plant": plant, "recipe": {}, "seed": seed, "twinning": {"arm": arm}, "ran": [seed], **settings}
+    (folder / "config.json").write_text(json.dumps(options))
     unseen = {
         "episodes": len(costs),
-        "costs": {"model_based": costs, "model_free": [9.0] * len(costs), "PI": [2.0] * len(costs)},
+        "costs": {"model_based": costs, "model_free": [9.0] * len(costs), "PI": [valve] * len(costs)},
         "merit": {"model_based": {"power [W]": {"mean": seed}}, "model_free": {"power [W]": {"mean": 0.0}}},
         "baselines": {"PI": {"merit": {"power [W]": {"mean": 5.0}}}},
     }
-    episodes = [{"real_cost": cost, "J_a_unseen": cost / 2.0} for cost in (4.0, 2.0)]
-    metrics = {"plant": plant, "episodes": episodes, "summary": {"live": "model_based", "unseen": unseen}}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
+    episodes = [
+        {"real_cost": 2.0 * cost if cost else cost, "J_a_unseen": cost, "seconds": {"plan": 1.5, "learn": 0.5}}
+        for cost in curve
+    ]
+    episodes[0] |= {"alarm": 1.0, "event": "swap"}
+    episodes[-1] |= {"alarm": 0.0, "event": "keep"}
+    summary = {"live": "model_based", "unseen": unseen}
+    (folder / "metrics.json").write_text(json.dumps({"plant": plant, "episodes": episodes, "summary": summary}))
     return folder
 
 
-def four(tmp_path):
-    return [
-        leave(tmp_path / f"{arm}-{seed}", arm=arm, seed=seed, costs=[mean - 0.5, mean + 0.5 + seed])
-        for arm, mean in KINDS.items()
-        for seed in (0, 1)
-    ]
+def rows(tmp_path):
+    """Two arms of three seeds: the second costs e^0.1, e^0.2 and e^0.3 times as much as the first."""
+    first, second = [], []
+    for seed, cost in enumerate((1.0, 3.0, 2.0)):
+        first.append(leave(tmp_path / f"a{seed}", seed=seed, costs=[cost - 0.5, cost + 0.5]))
+        dear = cost * math.exp(0.1 * (seed + 1))
+        curve = (4.0, 1.05) if seed else (4.0, 3.0)
+        second.append(leave(tmp_path / f"b{seed}", seed=seed, costs=[dear, dear], curve=curve, arm="model_based"))
+    return first, second
 
 
-def test_runs_that_differ_in_the_seed_are_one_row(tmp_path):
-    runs, controllers = entries_of(four(tmp_path))
-    assert [entry.name for entry in runs] == ["arm model-based", "arm model-free"]
-    np.testing.assert_allclose([entry.mean for entry in runs], [1.25, 3.25])
-    assert [entry.merit["power [W]"] for entry in runs] == [0.5, 0.5]
-    assert [(entry.name, entry.mean) for entry in controllers] == [("PI", 2.0)]
-    assert runs[0].curves == [[2.0, 1.0]] * 2
-    table = [line.split() for line in comparison_table(runs, controllers).splitlines()]
-    assert table[1][:4] == ["arm", "model-based", "2", "1.25"] and table[3][:2] == ["PI", "2"]
-    low, high = runs[0].interval()
-    assert 0.5 <= low < 1.25 < high <= 2.5
+def test_every_number_of_a_table_is_that_by_hand(tmp_path):
+    first, second = ([FinishedRun.read(folder) for folder in group] for group in rows(tmp_path))
+    limit = [0.25, 0.75]
+    a, b = Row(name="a", runs=first, optimum=1.0, limit=limit), Row(name="b", runs=second, optimum=1.0, limit=limit[:1])
+    numbers = Comparison("tanks", [a, b]).numbers()
+    assert numbers["controllers"] == {"PI": 2.0}
+    of_a, of_b = numbers["rows"]["a"], numbers["rows"]["b"]
+    assert of_a["seeds"] == [0, 1, 2] and of_a["J_a"] == {"median": 2.0, "least": 1.0, "greatest": 3.0}
+    assert of_a["paid"] == {"median": 12.0, "least": 12.0, "greatest": 12.0}  # 2 · (4 + 2)
+    assert of_a["regret"]["median"] == 10.0  # beyond two episodes of the optimum
+    assert of_a["J_a_ratio"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
+    assert of_a["over_limit"] == {"median": 4.0, "least": 2.0, "greatest": 6.0}  # over the mean of both episodes
+    assert of_b["over_limit"]["least"] == pytest.approx(math.exp(0.1) / 0.25)  # over the first episode alone
+    assert of_a["episodes_to_optimum"] == {"median": math.inf, "least": math.inf, "greatest": math.inf}
+    assert of_b["episodes_to_optimum"] == {"median": 2.0, "least": 2.0, "greatest": math.inf}
+    assert of_a["alarms"]["median"] == of_a["swaps"]["median"] == 1.0 and of_a["seconds"]["median"] == 4.0
+    assert of_a["merit"] == {"power [W]": 1.0}
+    # Logarithms of the ratios are 0.1, 0.2, 0.3: mean 0.2, deviation 0.1, and t(0.975, 2) = 4.30265.
+    half = 4.302652729749464 * 0.1 / math.sqrt(3.0)
+    assert of_b["J_a_ratio"]["ratio"] == pytest.approx(math.exp(0.2))
+    assert of_b["J_a_ratio"]["low"] == pytest.approx(math.exp(0.2 - half))
+    assert of_b["J_a_ratio"]["high"] == pytest.approx(math.exp(0.2 + half))
+    paid = [2.0 * 7.0, 2.0 * 5.05, 2.0 * 5.05]
+    assert of_b["paid_ratio"]["ratio"] == pytest.approx(math.prod(cost / 12.0 for cost in paid) ** (1.0 / 3.0))
 
 
-def test_the_figure_has_a_line_for_each_row(tmp_path):
-    runs, controllers = entries_of(four(tmp_path))
-    (ax,) = comparison_figure(runs, controllers, "t").axes
-    assert {line.get_label(): np.mean(line.get_ydata()) for line in ax.lines} == {
-        "arm model-based": 1.5,
-        "arm model-free": 1.5,
-        "PI": 2.0,
-    }
+def cells(text):
+    """Rows of the Markdown tables in a text by their first cell; the first table counts."""
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    return {line[0]: line for line in reversed(lines)}
 
 
-def test_a_policy_that_diverged_on_the_way_is_drawn(tmp_path):
-    """``metrics.json`` holds null for it."""
-    folders = four(tmp_path)
-    for folder in folders:
-        metrics = json.loads((folder / "metrics.json").read_text())
-        metrics["episodes"][0]["J_a_unseen"] = None
-        (folder / "metrics.json").write_text(json.dumps(metrics))
-    runs, controllers = entries_of(folders)
-    assert runs[0].curves == [[np.inf, 1.0]] * 2
-    comparison_figure(runs, controllers, "t").canvas.draw()
+def test_the_table_shows_these_numbers(tmp_path):
+    first, second = ([FinishedRun.read(folder) for folder in group] for group in rows(tmp_path))
+    comparison = Comparison("tanks", [Row(name="a", runs=first, optimum=1.0), Row(name="b", runs=second, optimum=1.0)])
+    table = cells(comparison.table())
+    assert table["a"] == "a|3|2 (1 … 3)|+100 %|1.000|12|1.000|10|never|1|1|4".split("|")
+    assert table["b"][4] == "1.221 [0.953, 1.566]" and table["b"][8] == "2 (2 … never)"
+    assert table["PI"][:3] == ["PI", "", "2"]
+    assert "| PI | 5 |" in comparison.table() and "| a | 1 |" in comparison.table()  # the plant's own quantities
+    wide = [comparison, Comparison("others", [Row(name="a", runs=first), Row(name="b", runs=first)])]
+    both = cells(study.overview(wide, "J_a_ratio"))
+    assert both["others"] == ["others", "1.000"]
+    assert both["geometric mean (systems)"][1] == f"{math.exp(0.1):.3f} (2)"
+
+
+@pytest.mark.parametrize(
+    ("costs", "others", "expected"),
+    [
+        ({0: 2.0, 5: 7.0}, {0: 1.0, 1: 9.0}, {"ratio": 2.0, "low": None, "high": None}),  # one common seed
+        ({0: 2.0}, {1: 1.0}, None),
+        ({0: -2.0, 1: 1.0}, {0: 1.0, 1: 1.0}, None),
+        ({0: math.inf, 1: 1.0}, {0: 1.0, 1: 1.0}, None),
+    ],
+)
+def test_ratios_are_those_of_common_seeds_with_positive_costs(costs, others, expected):
+    assert paired_ratio(costs, others) == (expected and {key: pytest.approx(expected[key]) for key in expected})
+
+
+def test_what_diverges_costs_infinitely(tmp_path):
+    run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[1.0, NAN], curve=(NAN, 1.0)))
+    assert run.cost == math.inf and run.curve == [math.inf, 1.0] and sum(run.real) == math.inf
+    row = cells(Comparison("tanks", [Row(name="a", runs=[run], optimum=1.0)]).table())["a"]
+    assert row[2] == row[4] == row[5] == "inf" and row[6] == "2"  # near the optimum after the second episode
+    comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()
+
+
+def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_path):
+    first, second = rows(tmp_path)
+    found = compare_runs([*first, *second])
+    assert [row.name for row in found.rows] == ["arm twinning", "arm model_based"]
+    assert [sorted(row.costs) for row in found.rows] == [[0, 1, 2]] * 2 and found.title == "tanks"
+    seeing = leave(tmp_path / "seeing", seed=0, costs=[1.0, 1.0], observe=["measured"])
+    other = leave(tmp_path / "other", seed=0, costs=[7.0, 7.0], valve=6.0, task="engineering")
+    found = compare_runs([first[0], seeing, other])
+    assert [len(group) for group in found.tasks()] == [2, 1]  # what a policy sees changes no task
+    numbers = found.numbers()
+    names = list(numbers["rows"])
+    assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
+    assert numbers["rows"][names[1]]["J_a_ratio"]["ratio"] == 1.0 and numbers["rows"][names[2]]["J_a_ratio"] is None
+    assert len(comparison_figure([found], "t").axes) == 2
 
 
 def test_runs_that_cannot_be_compared_are_refused(tmp_path):
-    first = leave(tmp_path / "a", arm="twinning", seed=0, costs=[1.0, 2.0])
-    with pytest.raises(ValueError, match=r"differ in their plant \(tanks, drone\)"):
-        entries_of([first, leave(tmp_path / "b", arm="twinning", seed=0, costs=[1.0, 2.0], plant="drone")])
-    with pytest.raises(ValueError, match=r"differ in their number of unseen episodes \(2, 3\)"):
-        entries_of([first, leave(tmp_path / "c", arm="twinning", seed=0, costs=[1.0, 2.0, 3.0])])
+    first = leave(tmp_path / "a", seed=0, costs=[1.0, 2.0])
+    for options, message in (
+        ({"plant": "drone"}, r"differ in their plant \(tanks, drone\)"),
+        ({"costs": [1.0] * 3}, r"differ in their number of unseen episodes \(2, 3\)"),
+        ({}, "have the same seed and the same options"),
+        ({"seed": 1, "valve": 2.1}, r"the runs have the same task, but PI costs 2, 2\.1 on their unseen"),
+    ):
+        other = leave(tmp_path / message[-9:], **{"seed": 0, "costs": [1.0, 2.0]} | options)
+        with pytest.raises(ValueError, match=message):
+            compare_runs([first, other])
+    (first / "metrics.json").write_text('{"episodes": [')
+    with pytest.raises(ValueError, match=r"metrics\.json is damaged"):
+        compare_runs([first])
     (first / "metrics.json").unlink()
     with pytest.raises(ValueError, match="has no metrics.json: it is not finished"):
-        entries_of([first])
-
-
-def on_the_twin(folder, **real):
-    """Make a finished run one that was judged on its own twin."""
-    file = folder / "metrics.json"
-    metrics = json.loads(file.read_text())
-    metrics["summary"]["unseen"]["judged_on"] = "twin"
-    metrics["summary"] |= real
-    file.write_text(json.dumps(metrics))
-    return folder
+        compare_runs([first])
+    with pytest.raises(ValueError, match="names no run"):
+        compare_runs([])
 
 
 def test_costs_on_different_twins_are_not_compared(tmp_path):
-    folders = [leave(tmp_path / f"{seed}", arm="model_based", seed=seed, costs=[1.0, 2.0]) for seed in (0, 1)]
-    for folder in folders:
-        on_the_twin(folder)
-    with pytest.raises(ValueError, match="judged on its own twin alone.*--real-unseen"):
-        entries_of(folders)
+    folders = [leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 2.0]) for seed in (0, 1)]
     found = {"episodes": 2, "J_a": {"mean": 5.0}, "merit": {"power [W]": {"mean": 8.0}}}
     real = {"controllers": {"model_based": found, "PI": found}, "costs": {"model_based": [4.0, 6.0], "PI": [7.0, 9.0]}}
-    runs, controllers = entries_of([on_the_twin(folder, real_unseen=real) for folder in folders])
-    assert [(entry.name, entry.mean) for entry in (*runs, *controllers)] == [(runs[0].name, 5.0), ("PI", 8.0)]
-    simulated = leave(tmp_path / "2", arm="model_based", seed=2, costs=[1.0, 2.0])
+    for flights in ({}, {"real_unseen": real}):
+        for folder in folders:
+            metrics = json.loads((folder / "metrics.json").read_text())
+            metrics["summary"]["unseen"]["judged_on"] = "twin"
+            metrics["summary"] |= flights
+            (folder / "metrics.json").write_text(json.dumps(metrics))
+        if not flights:
+            with pytest.raises(ValueError, match="judged on its own twin alone.*--real-unseen"):
+                compare_runs(folders)
+    found = compare_runs(folders)
+    assert found.rows[0].costs == {0: 5.0, 1: 5.0} and found.numbers()["controllers"] == {"PI": 8.0}
     with pytest.raises(ValueError, match="differ in their place of the unseen episodes"):
-        entries_of([*folders, simulated])
+        compare_runs([*folders, leave(tmp_path / "2", seed=2, costs=[1.0, 2.0])])
 
 
-# The ruler's table, from ruled trainings.
+def test_the_figure_has_medians_ranges_and_the_ends_of_its_panels(tmp_path):
+    runs = [
+        FinishedRun.read(leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 1.0], curve=curve))
+        for seed, curve in enumerate(((1e3, 1.0), (3.0, 1.5), (4.0, 2.0)))
+    ]
+    (ax,) = comparison_figure([Comparison("tanks", [Row(name="a", runs=runs, optimum=0.9)])], "t").axes
+    drawn = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in ax.lines}
+    assert drawn == {"a": [4.0, 1.5], "optimum": [0.9, 0.9], "PI": [2.0, 2.0]}
+    band = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == 1e3 and band.min() == 1.0
+    assert ax.get_ylim()[1] == pytest.approx(4.2) and ax.get_title(loc="right") == "up to 4.2"
 
 
-RULER = Path(__file__).parent / "ruler.py"
+# The study itself.
 
 
-def ruled(folder, model_based, model_free, paid):
-    folder.mkdir(parents=True)
-    unseen = {"J_a_model_based": {"mean": model_based}, "J_a_model_free": {"mean": model_free}}
-    metrics = {"summary": {"live": "model_free", "unseen": unseen}, "episodes": [{"real_cost": cost} for cost in paid]}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    (folder / "seconds.json").write_text("12.0")
+def config(tmp_path, **options):
+    usual = {"systems": (f"tiny={TINY}",), "arms": ("twinning",), "seeds": 2, "jobs": 1, "log_dir": tmp_path}
+    return study.Config(**usual | options)
 
 
-def test_a_row_has_ranges_and_counts_trainings_whose_dearer_policy_is_live(tmp_path):
-    ruled(tmp_path / "turbine-pitch" / "0", 1.0, 1.25, [2.0, 3.0])
-    ruled(tmp_path / "turbine-pitch" / "1", 1.5, 1.5, [4.0, 4.0])
-    command = [sys.executable, str(RULER), "--seeds", "2", "--folder", str(tmp_path), "--rows", "turbine, pitch"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "| turbine, pitch | 2 | 1.25 … 1.5 | 1 … 1.5 | 1 | 5 … 8 | 12 |"
+def test_systems_and_arms_have_names(tmp_path):
+    made = study.Config(
+        systems=("wind_turbine --unknown pitch", "gusty=flapping_wing --horizon=2", f"{TINY} --horizon=1"),
+        arms=("default=", "model_free", "sac=--twinning.learner.algorithm sac"),
+        given="--unseen 4",
+        log_dir=tmp_path,
+    )
+    assert list(made.systems_by_name()) == ["wind_turbine-unknown-pitch", "gusty", "small_recipe-horizon-1"]
+    arms = made.arms_by_name()
+    assert list(arms) == ["default", "model_free", "sac"] and arms["default"] == []
+    (training, *others) = made.trainings()["gusty", "model_free"]
+    assert training.words == ("--horizon=2", "--unseen", "4", "--twinning.arm", "model_free") and len(others) == 4
+    assert training.folder == tmp_path / "gusty" / "model_free" / "seed-0"
+    asked = training.asked()
+    assert (asked.horizon, asked.unseen, asked.twinning.arm, asked.unseen_every) == (2.0, 4, "model_free", 1)
+    small = study.Config(quick=True)
+    assert {key: len(group) for key, group in small.trainings().items()} == {
+        ("wind_turbine", arm): 2 for arm in ("twinning", "model_based", "model_free")
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seeds": 0}, "seeds=0 must be at least 1"),
+        ({"limit": 1}, "limit=1 must be 0, or at least 2"),
+        ({"arms": ()}, "arms names none"),
+        ({"arms": ("sac",)}, "'sac' has no name; write NAME=OPTIONS, or one of twinning"),
+        ({"arms": ("a=", "a=--patience 2")}, "'a' stands for two"),
+        ({"systems": ("moon=",)}, "names no recipe"),
+        ({"given": "--seed 3"}, "--seed: the study gives these to each training"),
+        ({"arms": ("x=--log_dir=y",)}, "--log_dir=y: the study gives"),
+        ({"systems": ("moon",)}, "moon.py does not exist"),
+    ],
+)
+def test_what_is_no_study_is_refused(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        study.studied(config(tmp_path, **options))
+
+
+def test_two_arms_and_two_seeds(tmp_path, capsys):
+    """The same command again trains nothing; more episodes go on, and other options are refused."""
+    arms = {"arms": ("twinning", "model_based")}
+    study.main(config(tmp_path, jobs=2, **arms))  # in two processes
+    found = json.loads((tmp_path / "study.json").read_text())["systems"]["tiny"]["rows"]
+    folders = {(arm, seed): tmp_path / "tiny" / arm / f"seed-{seed}" for arm in found for seed in (0, 1)}
+    written = {key: (folder / "metrics.json").read_bytes() for key, folder in folders.items()}
+    summaries = {key: json.loads(content)["summary"] for key, content in written.items()}
+    finals = {key: summary["unseen"][f"J_a_{summary['live']}"]["mean"] for key, summary in summaries.items()}
+    assert list(found) == ["twinning", "model_based"]
+    assert found["twinning"]["J_a"]["median"] == pytest.approx((finals["twinning", 0] + finals["twinning", 1]) / 2.0)
+    plant = LinearQuadratic(horizon=2.0)
+    best = found["twinning"]["optimum"]
+    unseen = UnseenEpisodes(plant, 3)
+
+    def cost(gain):
+        return unseen.control_costs(LinearGain(gain[None])).mean().item()
+
+    searched = minimize(cost, optimal_gain(1.0)[0], method="Nelder-Mead").fun
+    assert best == pytest.approx(searched, rel=1e-5) and best <= min(finals.values())
+    assert "| twinning | 2 |" in capsys.readouterr().out and (tmp_path / "study.png").stat().st_size > 5000
+    (yardstick,) = (tmp_path / "yardsticks").iterdir()
+    kept = yardstick.stat().st_mtime_ns
+    study.main(config(tmp_path, **arms))
+    assert {key: (folder / "metrics.json").read_bytes() for key, folder in folders.items()} == written
+    assert yardstick.stat().st_mtime_ns == kept
+    yardstick.write_text("{")
+    with pytest.warns(UserWarning, match=r"\.json is damaged; it is computed again"):
+        study.main(config(tmp_path, given="--episodes 2", **arms))
+    longer = json.loads((folders["twinning", 0] / "metrics.json").read_text())["episodes"]
+    assert len(longer) == 2 and longer[0] == json.loads(written["twinning", 0])["episodes"][0]
+    for given, message in (
+        ("", "seed-0 holds a run of other options: episodes is 1 here and was 2 in the run"),
+        ("--episodes 2 --horizon 1.0", r"horizon is 1\.0 here and was 2\.0 in the run"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            study.main(config(tmp_path, given=given))
+
+
+def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatch):
+    forward, calls = Interact.forward, []
+
+    def pressed(step, episode):
+        calls.append(step)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return forward(step, episode)
+
+    made = config(tmp_path, given="--episodes 2", optimum=False)
+    with monkeypatch.context() as patched:
+        patched.setattr(Interact, "forward", pressed)
+        with pytest.raises(KeyboardInterrupt):
+            study.studied(made)
+    first, second = (tmp_path / "tiny" / "twinning" / f"seed-{seed}" for seed in (0, 1))
+    assert len(json.loads((first / "metrics.json").read_text())["episodes"]) == 1 and not second.exists()
+    (comparison,), failures = study.studied(made)
+    assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]
+
+
+def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
+    broken = tmp_path / "broken.py"
+    broken.write_text(TINY.read_text().replace("    Run(config", "    if config.seed:\n        1 / 0\n    Run(config"))
+    with pytest.raises(ValueError, match=r"1 failed, the others are kept:\n.*seed-1: ZeroDivisionError: division"):
+        study.main(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
+    assert "| twinning | 1 |" in capsys.readouterr().out
+
+
+def test_ray_is_asked_for_by_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray.util.joblib", None)
+    with pytest.raises(ValueError, match=r"backend='ray' needs Ray: .*rt_torchrl\[cluster\]"):
+        study.studied(config(tmp_path, backend="ray"))
+
+
+@pytest.mark.slow
+def test_a_cluster_of_ray(tmp_path):
+    ray = pytest.importorskip("ray", reason="a cluster needs the extra cluster")
+    try:
+        (comparison,), failures = study.studied(config(tmp_path, backend="ray"))
+    finally:
+        ray.shutdown()
+    assert not failures and list(comparison.rows[0].costs) == [0, 1]
+
+
+def test_what_an_optimum_depends_on_has_a_file_of_its_own(tmp_path):
+    def of(words, **options):
+        return config(tmp_path, **options).yardsticks(study.Training(TINY, tuple(words.split()), 0, tmp_path))
+
+    plain = of("")["optimum"]
+    assert plain.path == of("--twinning.arm model_free --episodes 7")["optimum"].path
+    others = [of("--horizon 1.0")["optimum"], of("--unseen 5")["optimum"], of("", quick=True)["optimum"]]
+    assert len({plain.path, *(other.path for other in others)}) == 4
+    assert list(of("", limit=3, optimum=False)) == ["limit"]
+    message = "does not say how the limit is computed"
+    assert message in study.failure_of(of("", limit=3)["limit"])

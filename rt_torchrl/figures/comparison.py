@@ -1,6 +1,6 @@
-"""Figures of controllers beside each other: one episode, all unseen episodes, and what one quantity costs another."""
+"""Figures of controllers beside each other: one episode, and all unseen episodes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -111,32 +111,3 @@ def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]
     # Names take two lines, because four of them beside each other are wider than a panel.
     ax.set_xticks(range(len(values)), [who.replace("_", "-\n") for who in values])
     ax.set_xlim(-0.6, len(values) - 0.4)
-
-
-def pareto(
-    front: Sequence[tuple[float, float, float]],
-    others: Mapping[str, tuple[float, float]],
-    *,
-    title: str,
-    axes: tuple[str, str],
-) -> Figure:
-    """Optima along a weight as a curve, with the weight at each of them, and other controllers as points.
-
-    Args:
-        front: weight and the two quantities of each optimum.
-        others: the two quantities of each other controller, by name.
-        title: title of the figure.
-        axes: names of the two quantities, with their units.
-    """
-    figure, ((ax,),) = panels(1, title=title, size=(6.4, 4.6))
-    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
-    ax.plot([x for _, x, _ in front], [y for _, _, y in front], "o-", color=ROLES["model_based"], markersize=6)
-    for weight, x, y in front:
-        ax.annotate(f"{weight:g}", (x, y), xytext=(6, 5), **beside)
-    for name, (x, y) in others.items():
-        ax.plot([x], [y], "D", color=REFERENCE, markersize=7)
-        ax.annotate(name, (x, y), xytext=(8, -4), color=REFERENCE, **beside)
-    ax.set_xlabel(axes[0])
-    ax.set_ylabel(axes[1])
-    ax.margins(0.12)
-    return figure

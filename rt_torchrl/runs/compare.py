@@ -1,0 +1,452 @@
+"""Finished runs beside each other: what they cost over several seeds, as a table, as numbers and as a figure."""
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import BESIDE, flat, read_settings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NEAR = 0.1
+"""Distance from the optimum, as a share of it, within which a policy is near the optimum."""
+ROUNDING = 1e-6
+"""Relative difference of a controller's costs on the same episodes that counts as rounding."""
+OF_EVERY_RUN = frozenset(option.name for option in fields(RunConfig))
+APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
+"""Settings in which the runs of one row may differ."""
+WIDEST_LINEAR = 5.0
+"""Ratio of the greatest to the least cost above which the axis of a panel is logarithmic."""
+DEAREST_SHOWN = 10.0
+"""Greatest cost that a panel shows, over the costs of controllers, of the optimum and of the first row at the end."""
+COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
+MARKERS = "os^DvP*X"
+DASHES = ("--", ":", "-.", (0, (1, 1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedRun:
+    """What a finished run cost; numbers that the run holds as null, because something diverged, are infinite.
+
+    Args:
+        folder: run folder.
+        settings: content of ``config.json``.
+        place: system that the costs on unseen episodes are those of: the simulated or the real one.
+        costs: J_a of the policy that was live at the end, on each unseen episode.
+        curve: mean J_a of the live policy on the unseen episodes after each real episode (``--unseen-every 1``), or
+            J_a of the real episodes.
+        judged: whether ``curve`` holds costs on unseen episodes.
+        real: J_a of each real episode.
+        merit: mean of each of the plant's own quantities under that policy.
+        controllers: J_a of each classical controller, mean over the unseen episodes.
+        controllers_merit: the plant's own quantities of each classical controller.
+        alarms: number of episodes with an alarm.
+        swaps: number of changes of roles.
+        seconds: time of the six steps in all episodes [s].
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    place: str
+    costs: list[float]
+    curve: list[float]
+    judged: bool
+    real: list[float]
+    merit: dict[str, float]
+    controllers: dict[str, float]
+    controllers_merit: dict[str, dict[str, float]]
+    alarms: int
+    swaps: int
+    seconds: float
+
+    @property
+    def seed(self) -> int:
+        return int(self.settings["seed"])
+
+    @property
+    def cost(self) -> float:
+        """J_a of the policy that was live at the end, mean over the unseen episodes."""
+        return statistics.fmean(self.costs)
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """The options that make plant, inputs and cost: those that only this recipe has, but what policies observe."""
+        return {k: v for k, v in self.settings.items() if k not in {*OF_EVERY_RUN, *BESIDE, "observe"}}
+
+    @classmethod
+    def read(cls, folder: Path) -> "FinishedRun":
+        """The run in a folder.
+
+        Raises:
+            ValueError: if the folder holds no finished run, its results are damaged, or it was judged on its own twin
+                alone.
+        """
+        from rt_torchrl.runs.results import judged_on_the_system, on_the_twin  # here, because it loads TorchRL
+
+        settings, file = read_settings(folder), folder / "metrics.json"
+        if not file.is_file():
+            raise ValueError(f"the run in {folder} has no metrics.json: it is not finished; go on with it by --resume.")
+        try:
+            metrics = json.loads(file.read_text(encoding="utf-8"))
+            summary, episodes = metrics["summary"], metrics["episodes"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} is damaged: {error!r}") from error
+        unseen, live = judged_on_the_system(summary)
+        judged = all("J_a_unseen" in episode for episode in episodes)
+        return cls(
+            folder=folder,
+            settings=settings,
+            place="real system" if on_the_twin(summary["unseen"]) else "simulation",
+            costs=_numbers(unseen["costs"][live]),
+            curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
+            judged=judged,
+            real=_numbers(episode["real_cost"] for episode in episodes),
+            merit=_means(unseen["merit"][live]),
+            controllers={name: statistics.fmean(_numbers(unseen["costs"][name])) for name in unseen["baselines"]},
+            controllers_merit={name: _means(judged["merit"]) for name, judged in unseen["baselines"].items()},
+            alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
+            swaps=sum(episode.get("event") == "swap" for episode in episodes),
+            seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Runs that differ in nothing but the seed.
+
+    Args:
+        name: name of the row.
+        runs: the runs.
+        optimum: least cost that a policy of this class can have on the unseen episodes; None if nobody knows it.
+        limit: least cost that any commands can have on each of the first unseen episodes; None if nobody knows it.
+    """
+
+    name: str
+    runs: Sequence[FinishedRun]
+    optimum: float | None = None
+    limit: Sequence[float] | None = None
+
+    @property
+    def costs(self) -> dict[int, float]:
+        """J_a on the unseen episodes at the end, by seed."""
+        return {run.seed: run.cost for run in self.runs}
+
+    @property
+    def paid(self) -> dict[int, float]:
+        """Sum of J_a of the real episodes, by seed."""
+        return {run.seed: sum(run.real) for run in self.runs}
+
+    @property
+    def regret(self) -> list[float] | None:
+        """What each run has paid beyond as many episodes of the optimum."""
+        if self.optimum is None:
+            return None
+        return [sum(run.real) - len(run.real) * self.optimum for run in self.runs]
+
+    @property
+    def episodes_to_optimum(self) -> list[float] | None:
+        """Number of real episodes until the live policy of each run is near the optimum; infinite for never."""
+        if self.optimum is None or not all(run.judged for run in self.runs):
+            return None
+        near = self.optimum + NEAR * abs(self.optimum)
+        reached = [[k for k, cost in enumerate(run.curve, 1) if cost <= near] for run in self.runs]
+        return [float(numbers[0]) if numbers else math.inf for numbers in reached]
+
+    def numbers(self, first: "Row") -> dict[str, Any]:
+        """All statistics: median and range over the seeds, and ratios to another row, as :func:`paired_ratio` has them.
+
+        Args:
+            first: row that this one is compared with; costs of another task are not.
+        """
+        same = self.runs[0].task == first.runs[0].task
+        over_limit = None
+        if self.limit:
+            least, count = statistics.fmean(self.limit), len(self.limit)
+            over_limit = [statistics.fmean(run.costs[:count]) / least for run in self.runs]
+        return {
+            "seeds": sorted(self.costs),
+            "J_a": spread(list(self.costs.values())),
+            "J_a_ratio": paired_ratio(self.costs, first.costs) if same else None,
+            "optimum": self.optimum,
+            "over_limit": spread(over_limit),
+            "paid": spread(list(self.paid.values())),
+            "paid_ratio": paired_ratio(self.paid, first.paid) if same else None,
+            "regret": spread(self.regret),
+            "episodes_to_optimum": spread(self.episodes_to_optimum),
+            "alarms": spread([float(run.alarms) for run in self.runs]),
+            "swaps": spread([float(run.swaps) for run in self.runs]),
+            "seconds": spread([run.seconds for run in self.runs]),
+            "merit": {name: statistics.median(run.merit[name] for run in self.runs) for name in self.runs[0].merit},
+            "curves": [run.curve for run in self.runs],
+        }
+
+
+class Comparison:
+    """Rows of one plant; the first one is what the others are compared with.
+
+    Args:
+        title: name of the system.
+        rows: rows, whose runs were judged on the same number of unseen episodes of one plant, at one place.
+
+    Raises:
+        ValueError: if they were not, a seed occurs twice in a row, or a controller costs differently in one task.
+    """
+
+    def __init__(self, title: str, rows: Sequence[Row]):
+        runs = [run for row in rows for run in row.runs]
+        for name, values in (
+            ("plant", [str(run.settings["plant"]) for run in runs]),
+            ("number of unseen episodes", [str(len(run.costs)) for run in runs]),
+            ("place of the unseen episodes", [run.place for run in runs]),
+        ):
+            if len(set(values)) > 1:
+                raise ValueError(f"the runs differ in their {name} ({', '.join(values)}); compare runs of one.")
+        for row in rows:
+            seeds = [run.seed for run in row.runs]
+            if len(set(seeds)) < len(seeds):
+                folders = ", ".join(str(run.folder) for run in row.runs if seeds.count(run.seed) > 1)
+                raise ValueError(f"{folders} have the same seed and the same options; give one of them.")
+        self.title, self.rows = title, rows
+        self._require_one_plant()
+
+    def _require_one_plant(self) -> None:
+        """Runs in code may have the same options and different plants, on which controllers cost differently."""
+        for group in self.tasks():
+            runs = [run for row in group for run in row.runs if run.place == "simulation"]
+            for name in {name for run in runs for name in run.controllers}:
+                costs = [run.controllers[name] for run in runs if name in run.controllers]
+                if not np.allclose(costs, costs[0], rtol=ROUNDING, equal_nan=True):
+                    shown = ", ".join(f"{cost:.6g}" for cost in costs)
+                    raise ValueError(
+                        f"the runs have the same task, but {name} costs {shown} on their unseen episodes: their plants "
+                        "differ in what no option says. Compare runs of one plant."
+                    )
+
+    def tasks(self) -> list[list[Row]]:
+        """The rows, those of one task together: costs of different tasks do not compare."""
+        groups: dict[str, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(json.dumps(row.runs[0].task, sort_keys=True), []).append(row)
+        return list(groups.values())
+
+    def controllers(self) -> dict[str, tuple[float, dict[str, float]]]:
+        """J_a and the plant's own quantities of each classical controller; of several tasks, each with a row's name."""
+        groups = self.tasks()
+        controllers: dict[str, tuple[float, dict[str, float]]] = {}
+        for rows in groups:
+            run, task = rows[0].runs[0], f" ({rows[0].name})" if len(groups) > 1 else ""
+            controllers |= {
+                f"{name}{task}": (cost, run.controllers_merit[name]) for name, cost in run.controllers.items()
+            }
+        return controllers
+
+    def numbers(self) -> dict[str, Any]:
+        """All statistics by row, and J_a of the classical controllers by name."""
+        return {
+            "rows": {row.name: row.numbers(self.rows[0]) for row in self.rows},
+            "controllers": {name: cost for name, (cost, _) in self.controllers().items()},
+        }
+
+    def table(self) -> str:
+        """The statistics and, below them, the plant's own quantities, as two Markdown tables."""
+        first = self.rows[0].name
+        numbers: dict[str, dict[str, Any]] = self.numbers()["rows"]
+        lines, merits = [], {}
+        for name, row in numbers.items():
+            known = row["optimum"] is not None
+            lines.append(
+                [
+                    name,
+                    str(len(row["seeds"])),
+                    with_range(row["J_a"]),
+                    f"{100.0 * (row['J_a']['median'] / row['optimum'] - 1.0):+.3g} %" if known else "",
+                    with_range(row["over_limit"]),
+                    with_interval(row["J_a_ratio"]),
+                    with_range(row["paid"]),
+                    with_interval(row["paid_ratio"]),
+                    with_range(row["regret"]),
+                    with_range(row["episodes_to_optimum"]).replace("inf", "never"),
+                    *(with_range(row[key]) for key in ("alarms", "swaps", "seconds")),
+                ]
+            )
+            merits[name] = row["merit"]
+        for name, (cost, merit) in self.controllers().items():
+            lines.append([name, "", f"{cost:.4g}", *[""] * 10])
+            merits[name] = merit
+        optima = {row.optimum: row.name for row in reversed(self.rows) if row.optimum is not None}
+        for cost, name in reversed(optima.items()):
+            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 10])
+        header = ["", "seeds", "J_a", "over the optimum", "over the limit", f"J_a over {first}", "Σ J_a"]
+        header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "role changes", "seconds"]
+        kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
+        tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
+        if quantities := list(self.rows[0].runs[0].merit):
+            rows = [[name, *(f"{merit[quantity]:.4g}" for quantity in quantities)] for name, merit in merits.items()]
+            tables.append(markdown(["", *quantities], rows))
+        return "\n\n".join(tables)
+
+
+def compare_runs(folders: Iterable[Path | str]) -> Comparison:
+    """Finished runs of one plant beside each other: those that differ in nothing but the seed are one row.
+
+    Rows of different tasks, horizons or inputs have no ratio, and classical controllers of their own.
+
+    Args:
+        folders: run folders; the first one belongs to the row that the others are compared with.
+
+    Raises:
+        ValueError: if a folder holds no finished run, a seed occurs twice in a row, or the runs cannot be compared.
+    """
+    runs = [FinishedRun.read(Path(folder)) for folder in folders]
+    if not runs:
+        raise ValueError("folders names no run; give the folders of finished runs.")
+    options = [flat({key: value for key, value in run.settings.items() if key not in APART}) for run in runs]
+    keys = dict.fromkeys(key for each in options for key in each)
+    differing = [key for key in keys if len({json.dumps(each.get(key)) for each in options}) > 1]
+    rows: dict[str, list[FinishedRun]] = {}
+    for run, each in zip(runs, options, strict=True):
+        shown = [f"{key.removeprefix('twinning.')} {_words(each.get(key))}" for key in differing]
+        rows.setdefault(", ".join(shown) or "all", []).append(run)
+    title = str(runs[0].settings["plant"]).replace("_", " ")
+    return Comparison(title, [Row(name=name, runs=row) for name, row in rows.items()])
+
+
+def spread(values: Sequence[float] | None) -> dict[str, float] | None:
+    """Median, least and greatest of some values; None of None."""
+    if values is None:
+        return None
+    return {"median": statistics.median(values), "least": min(values), "greatest": max(values)}
+
+
+def paired_ratio(costs: dict[int, float], others: dict[int, float]) -> dict[str, float | None] | None:
+    """Geometric mean of the ratios of costs that belong to the same seed, with its 95 % interval.
+
+    The interval is that of Student's t for the mean of the logarithms; a single pair has none.
+
+    Args:
+        costs: costs by seed.
+        others: costs that they are divided by, by seed.
+
+    Returns:
+        ``ratio``, ``low`` and ``high``; None without common seeds, or where a cost is not positive or not finite.
+    """
+    from scipy.stats import t  # here, because it takes a second to load
+
+    pairs = [(costs[seed], others[seed]) for seed in costs if seed in others]
+    if not pairs or not all(0.0 < cost < math.inf for pair in pairs for cost in pair):
+        return None
+    logs = np.array([math.log(cost / other) for cost, other in pairs])
+    n, mean = len(logs), float(logs.mean())
+    if n == 1:
+        return {"ratio": math.exp(mean), "low": None, "high": None}
+    half = float(t.ppf(0.975, n - 1) * logs.std(ddof=1)) / math.sqrt(n)
+    return {"ratio": math.exp(mean), "low": math.exp(mean - half), "high": math.exp(mean + half)}
+
+
+def with_range(values: dict[str, float] | None) -> str:
+    """A median with its range, for a table."""
+    if values is None:
+        return ""
+    median, low, high = (f"{value:.4g}" for value in values.values())
+    return median if low == high else f"{median} ({low} … {high})"
+
+
+def with_interval(ratio: dict[str, float | None] | None) -> str:
+    """A ratio with its interval, for a table."""
+    if ratio is None:
+        return ""
+    shown = [f"{value:.3f}" if value < 10.0 else f"{value:.3g}" for value in ratio.values() if value is not None]
+    if ratio["low"] in (None, ratio["high"]):  # of one seed, or of a row over itself
+        return shown[0]
+    return f"{shown[0]} [{shown[1]}, {shown[2]}]"
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
+
+
+def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure":
+    """J_a of the live policies over the real episodes: a panel for each system, and for each of its tasks.
+
+    A line is the median of a row's seeds, its band their range. The optimum and classical controllers are horizontal.
+    Costs above ten times those of controllers, optimum and first row are cut off; a panel says so, and names the rows.
+    """
+    from matplotlib.ticker import MaxNLocator  # here, because tables need no figure
+
+    from rt_torchrl.figures.style import legend_below, panels
+
+    drawn = [(comparison, rows) for comparison in comparisons for rows in comparison.tasks()]
+    names = list(dict.fromkeys(row.name for comparison in comparisons for row in comparison.rows))
+    columns = min(3, len(drawn))
+    size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(drawn) // columns))
+    figure, axes = panels(-(-len(drawn) // columns), columns, title=title, size=size)
+    for ax in axes.flat[len(drawn) :]:
+        ax.remove()
+    for ax, (comparison, rows) in zip(axes.flat, drawn, strict=False):
+        whole = len(comparison.tasks()) == 1
+        _panel(ax, rows, names, comparison.title if whole else f"{comparison.title}, {rows[0].name}")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_xlabel("real episodes")
+    legend_below(figure, list(axes.flat[: len(drawn)]))
+    return figure
+
+
+def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) -> None:
+    """The rows of one task of one system."""
+    from rt_torchrl.figures.style import REFERENCE_LINE, caption, plain_numbers
+
+    known, medians, every = [], {}, []
+    for row in rows:
+        length, place = min(len(run.curve) for run in row.runs), names.index(row.name)
+        curves = np.array([run.curve[:length] for run in row.runs])
+        number, medians[row.name] = np.arange(1, length + 1), np.median(curves, 0)
+        look: dict[str, Any] = {"color": COLOURS[place % len(COLOURS)]}
+        ax.fill_between(number, curves.min(0), curves.max(0), alpha=0.12, linewidth=0, **look)
+        marker = f"{MARKERS[place % len(MARKERS)]}-"
+        ax.plot(number, medians[row.name], marker, markersize=4, label=row.name, **look)
+        every.append(curves.ravel())
+    for optimum in {row.optimum for row in rows if row.optimum is not None}:
+        ax.axhline(optimum, color="black", linewidth=1.0, label="optimum")
+        known.append(optimum)
+    for (name, cost), dash in zip(rows[0].runs[0].controllers.items(), DASHES * len(names), strict=False):
+        ax.axhline(cost, label=name, **REFERENCE_LINE | {"linestyle": dash})
+        known.append(cost)
+    known = [cost for cost in (*known, medians[rows[0].name][-1]) if math.isfinite(cost)]
+    shown = np.concatenate([*every, known])
+    top = DEAREST_SHOWN * max(known, default=math.inf)
+    note = ""
+    if top > 0.0 and shown.max() > top:
+        shown = shown[shown <= top]
+        ax.set_ylim(top=1.05 * shown.max())
+        above = [name for name, median in medians.items() if median.min() > top]
+        note = f"up to {1.05 * shown.max():.2g}" + (f"; above: {', '.join(above)}" if above else "")
+    shown = shown[np.isfinite(shown)]
+    if shown.min() > 0.0 and shown.max() > WIDEST_LINEAR * shown.min():
+        ax.set_yscale("log")
+        plain_numbers(ax)
+        ax.set_ylim(bottom=0.9 * shown.min())
+    else:
+        ax.set_ylim(bottom=shown.min() - 0.05 * (shown.max() - shown.min()))
+    caption(ax, f"{title}: $J_a$", note)
+
+
+def _numbers(values: Iterable[float | None]) -> list[float]:
+    return [math.inf if value is None else float(value) for value in values]
+
+
+def _means(merit: dict[str, dict[str, Any]]) -> dict[str, float]:
+    return {name: math.nan if found["mean"] is None else float(found["mean"]) for name, found in merit.items()}
+
+
+def _words(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
