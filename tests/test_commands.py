@@ -90,7 +90,7 @@ def test_a_recipe_takes_the_options_that_a_sentence_names(given):
 def help_of(name):
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):
-        from_command_line(CONFIGS[name], ["--help"])
+        from_command_line(CONFIGS[name], ["--help-all"])
     return shown.getvalue()
 
 

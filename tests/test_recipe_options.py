@@ -168,13 +168,28 @@ def test_a_plant_without_a_paper_has_no_words_of_it():
 def test_the_help_shows_the_defaults_that_hold(words, spread, rate, capsys):
     config = config_class_of(RECIPES / "wind_turbine.py")
     with pytest.raises(SystemExit) as ended:
-        from_command_line(config, [*words, "--help"])
+        from_command_line(config, [*words, "--help-all"])
     printed = capsys.readouterr()
     assert ended.value.code == 0 and not printed.err
     said = " ".join(printed.out.replace("│", " ").split())
     for option, value in (("exploration.spread FLOAT", spread), ("learner.target-rate FLOAT", rate)):
         described = said.split(f"--twinning.{option}")[1].split(" --")[0]
         assert f"(default: {value})" in described
+
+
+@pytest.mark.parametrize("plant", [*PLANTS, "pendulum", "served_turbine"])
+def test_the_help_has_a_screenful_of_options_and_help_all_has_the_rest(plant, capsys):
+    config = config_class_of(RECIPES / f"{plant}.py")
+    listed = []
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as ended:
+            from_command_line(config, [word])
+        assert ended.value.code == 0
+        listed.append(re.findall(r"(?m)^[│ ]*--([a-z][a-z.-]*)", capsys.readouterr().out))
+    short, full = (set(names) - {"help-all"} for names in listed)
+    parts = {field.name for field in dataclasses.fields(config) if dataclasses.is_dataclass(field.type)}
+    assert {name.replace("-", "_") for name in short} == {field.name for field in dataclasses.fields(config)} - parts
+    assert short < full and {"twinning.learner.discount", "operation.clock"} < full
 
 
 # Values that an option of their type cannot have are refused when a configuration is made in code.

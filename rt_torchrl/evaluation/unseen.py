@@ -7,22 +7,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, continued, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # who draws unseen episodes of a plant needs no TorchRL
+    from tensordict import TensorDictBase
+    from tensordict.nn import TensorDictModule
+
     from rt_torchrl.plants.signal import StateBounds
+    from rt_torchrl.systems.real_system import RealSystem
 
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
@@ -280,7 +281,7 @@ class RealEpisodes(UnseenEpisodes):
 
     judged_on = "real system"
 
-    def __init__(self, system: RealSystem, count: int = 20, *, device: torch.device | str = "cpu"):
+    def __init__(self, system: "RealSystem", count: int = 20, *, device: torch.device | str = "cpu"):
         super().__init__(system.plant, count, device=device)
         self.closure = None
         self._system, self._count = system, count
@@ -310,7 +311,7 @@ class RealEpisodes(UnseenEpisodes):
             self._system.load_state_dict(kept)
         return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
 
-    def _to_the_horizon(self, episode: TensorDictBase) -> Trajectory:
+    def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""
         rest = self.plant.n_steps - len(episode)
         end, action = episode["next", "state"][-1:], episode["next", "applied"][-1:]
@@ -320,8 +321,10 @@ class RealEpisodes(UnseenEpisodes):
             continued(episode["exogenous"], self.plant.n_steps),
         )
 
-    def _actor(self, policy: nn.Module) -> TensorDictModule:
+    def _actor(self, policy: nn.Module) -> "TensorDictModule":
         """The policy at the beginning of an episode."""
+        from tensordict.nn import TensorDictModule
+
         if not isinstance(policy, StateFeedback):
             return TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
         device = self.initial_state.device

@@ -1,5 +1,6 @@
 """Command lines of recipes, which are files with a ``Config`` and a ``main``; recipes and plants by their names."""
 
+import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -16,12 +17,13 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 import rt_torchrl.envs
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import module_of, named
+from rt_torchrl.runs.settings import BESIDE, as_written, module_of, named
 from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
 
 Configuration = TypeVar("Configuration")
@@ -68,6 +70,11 @@ def _is_for_users(error: Exception) -> bool:
     return ours and (last.line or "").startswith("raise ")
 
 
+HELP, HELP_ALL = ("-h", "--help"), "--help-all"
+"""Words that ask for help: on the options of the recipe and its run, or on all."""
+MORE = f"{HELP_ALL} also lists the options whose names have dots, such as the parameters of the six steps."
+
+
 def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:
     """The configuration that a command line asks for.
 
@@ -80,22 +87,34 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
         arguments: words of the command line; by default those of this process.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    if not issubclass(config_class, RunConfig):
-        return tyro.cli(config_class, args=words)
-    # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
-    return tyro.cli(config_class, args=words, default=cast(Configuration, _defaults(config_class, words)))
-
-
-HELP = ("-h", "--help")
-"""Words that ask for help."""
-
-
-def _defaults(config_class: type[RunConfig], words: Sequence[str]) -> RunConfig:
-    """The defaults of all options beside those that are given, with which help is asked for or not."""
-    rest = [word for word in words if word not in HELP]
+    rest = [word for word in words if word not in (*HELP, HELP_ALL)]
     helped = len(rest) < len(words)
+    if issubclass(config_class, RunConfig):
+        # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
+        default = cast(Configuration, _defaults(config_class, rest, helped=helped))
+    else:
+        default = tyro.MISSING_NONPROP
+    if not helped:
+        return tyro.cli(config_class, args=rest, default=default)
+    parts = ConstructorRegistry()
+
+    @parts.struct_rule
+    def hidden(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if HELP_ALL in words or info.type is config_class or not dataclasses.is_dataclass(info.type):
+            return None
+        return StructConstructorSpec(instantiate=lambda: info.default, fields=())
+
+    with contextlib.suppress(SystemExit):
+        tyro.cli(config_class, args=["--help"], default=default, registry=parts)
+    if HELP_ALL not in words:
+        print(MORE)
+    raise SystemExit(0)
+
+
+def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bool) -> RunConfig:
+    """The defaults of all options beside those that are given, with which help is asked for or not."""
     try:
-        config = tyro.cli(config_class, args=rest, console_outputs=not helped)
+        config = tyro.cli(config_class, args=words, console_outputs=not helped)
         return config.defaults() if config.config is None else of_file(config.config, config)
     except (SystemExit, ValueError, OSError):
         if helped:  # beside words that cannot be carried out, too
@@ -116,11 +135,6 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
         ValueError: if the file cannot be read, is that of another recipe, or holds an option that does not exist or a
             value that it does not take.
     """
-    from rt_torchrl.runs.settings import (
-        BESIDE,
-        as_written,  # here, because --help needs none of it
-    )
-
     try:
         text = path.read_text(encoding="utf-8")
         if text.startswith("\ufeff"):

@@ -17,7 +17,6 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.results import on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
@@ -123,7 +122,7 @@ class LoadedRun:
         """
         if on not in ("real", "twin"):
             raise ValueError(f"on={on!r} must be real or twin.")
-        if on == "real" and on_the_twin(self.metrics["summary"].get("unseen", {})):
+        if on == "real" and self.metrics["summary"].get("unseen", {}).get("judged_on") == "twin":
             raise ValueError(
                 "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
                 "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
