@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +16,9 @@ import torch
 import tyro
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, configuration, main_of, read_log
-from rt_torchrl.atomic_file import new_folder, write_results
+from rt_torchrl.atomic_file import make_folder, new_folder, write_results
 from rt_torchrl.fit.least_squares import Identified, identify
-from rt_torchrl.fit.log import Column, checked
+from rt_torchrl.fit.log import Column, checked, pandas
 from rt_torchrl.fit.resampling import (
     ROUNDING,
     Resampled,
@@ -33,6 +34,9 @@ from rt_torchrl.options import Count, Positive
 from rt_torchrl.runs.command_line import plant_class
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_folder import save_tensors
+
+SHOWN = ("before", "after", "standard_error")
+"""What the terminal shows of a weight."""
 
 
 @configuration
@@ -123,17 +127,11 @@ class Config:
         """
         from rt_torchrl.runs.run_folder import WRITTEN  # here, because --help need not wait for TorchRL
 
-        folder = self.log_dir
-        there = [name for name in WRITTEN if folder and (folder / name).exists()]
+        folder = self.log_dir or new_folder(Path("runs") / "identify" / plant)
+        there = [name for name in WRITTEN if (folder / name).exists()]
         if there:
             raise ValueError(f"log_dir={folder} holds results already ({', '.join(there)}); choose another folder.")
-        try:
-            folder = folder or new_folder(Path("runs") / "identify" / plant)
-            (folder / "figures").mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ValueError(
-                f"the folder of the results cannot be written ({error}); choose another with --log-dir."
-            ) from error
+        make_folder("log_dir", folder / "figures")
         return folder
 
 
@@ -170,40 +168,31 @@ def main(config: Config) -> None:
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
     print(table(metrics))
-    for name, share in filter(lambda entry: entry[1], metrics["held_back"].items()):
-        print(f"  the plant's actuators hold back {name} in {share:.1%} of the log")
     print(f"results in {folder}")
 
 
 def metrics_of(found: Identified) -> dict[str, Any]:
     """The content of ``metrics.json``: errors of every sensor, weights, noise, initial states; unknown is null."""
-    estimate = found.estimate
+    estimate, uncertainty = found.estimate, found.estimate.uncertainty
     sensors, states = estimate.likelihood.sensors, estimate.likelihood.plant.states
+    names, units = [sensor.name for sensor in sensors], [sensor.measurement.unit for sensor in sensors]
     summary: dict[str, Any] = {"iterations": estimate.iterations, "prior": estimate.stiffness}
     summary["segment"] = estimate.segment
     for side in ("training", "held_out"):
-        before, after = (map(_number, judged.rms.tolist()) for judged in getattr(found, side))
-        each = zip(sensors, before, after, strict=True)
-        rms = {s.name: {"unit": s.measurement.unit, "before": first, "after": last} for s, first, last in each}
-        summary[side] = {"rms": rms}
-    names = [sensor.name for sensor in sensors]
-    summary["autocorrelation"] = dict(zip(names, map(_number, found.autocorrelation.tolist()), strict=True))
+        before, after = (_numbers(judged.rms.tolist()) for judged in getattr(found, side))
+        each = zip(names, units, before, after, strict=True)
+        summary[side] = {"rms": {name: {"unit": unit, "before": b, "after": a} for name, unit, b, a in each}}
+    summary["autocorrelation"] = dict(zip(names, _numbers(found.autocorrelation.tolist()), strict=True))
     summary["noise"], summary["bias"] = estimate.noise, estimate.biases
-    errors, intervals = estimate.uncertainty.standard_errors(), estimate.uncertainty.intervals()
+    errors, intervals = uncertainty.standard_errors(), uncertainty.intervals()
     summary["weights"] = {
-        name: {
-            "before": estimate.before[name],
-            "after": value,
-            "standard_error": _number(errors[name]),
-            "interval": [_number(end) for end in intervals[name]],
-        }
+        name: {"before": estimate.before[name], "after": value, "interval": _numbers(intervals[name])}
+        | dict(zip(["standard_error"], _numbers([errors[name]]), strict=True))
         for name, value in estimate.after.items()
     }
-    first, scatter = estimate.initial.tolist(), estimate.uncertainty.initial_errors().tolist()
-    summary["initial_states"] = [
-        {state.name: [value, _number(error)] for state, value, error in zip(states, *pair, strict=True)}
-        for pair in zip(first, scatter, strict=True)
-    ]
+    starts = zip(estimate.initial.tolist(), map(_numbers, uncertainty.initial_errors().tolist()), strict=True)
+    named = [state.name for state in states]
+    summary["initial_states"] = [dict(zip(named, map(list, zip(*pair, strict=True)), strict=True)) for pair in starts]
     return summary | {"warnings": estimate.warnings()}
 
 
@@ -238,32 +227,28 @@ def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
 
 def table(metrics: dict[str, Any]) -> str:
     """The results, for the terminal."""
-    lines = [f"  {'':<32}{'before':>12}{'after':>12}"]
-    for side in ("training", "held_out"):
-        lines.append(f"  RMS errors, {side.replace('_', ' ')}")
-        for sensor, rms in metrics[side]["rms"].items():
-            label = f"{sensor} [{rms['unit']}]"
-            lines.append(f"    {label:<30}{_shown(rms['before']):>12}{_shown(rms['after']):>12}")
-    levels = ", ".join(f"{name} {value:.3g}" for name, value in metrics["noise"].items())
-    lines.append(f"  noise of the sensors: {levels}")
-    biases = ", ".join(f"{name} {value:.3g}" for name, value in metrics["bias"].items() if value)
-    lines += [f"  bias of the sensors: {biases}"] if biases else []
-    correlation = ", ".join(f"{name} {_shown(value)}" for name, value in metrics["autocorrelation"].items())
-    lines.append(f"  correlation of neighbouring residuals: {correlation}")
-    lines.append(f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}")
-    for name, entry in metrics["weights"].items():
-        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
-        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
-    lines += [f"  note: {warning}" for warning in metrics["warnings"]]
-    return "\n".join(lines)
+    of_sensors = {
+        f"{name} [{rms['unit']}], {side.replace('_', ' ')}": {"RMS error before": rms["before"], "after": rms["after"]}
+        for side in ("training", "held_out")
+        for name, rms in metrics[side]["rms"].items()
+    }
+    told = {key: metrics[key] for key in ("noise", "bias")} | {"neighbours' correlation": metrics["autocorrelation"]}
+    weights = {name: {key: entry[key] for key in SHOWN} for name, entry in metrics["weights"].items()}
+    frame = pandas().DataFrame
+    blocks = [frame(of_sensors).T, frame(told), frame(weights).T]
+    shown = [block.astype(float).to_string(float_format="{:.5g}".format, na_rep="unknown") for block in blocks]
+    notes = [f"note: {warning}" for warning in metrics["warnings"]]
+    notes += [
+        f"the plant's actuators hold back {name} in {share:.1%} of the log"
+        for name, share in metrics["held_back"].items()
+        if share
+    ]
+    return "\n\n".join([*shown, "\n".join(notes)])
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _shown(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    """Finite numbers; None in the place of others, which JSON has not."""
+    return [value if math.isfinite(value) else None for value in values]
 
 
 if __name__ == "__main__":

@@ -278,7 +278,7 @@ def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
         f"{name}.png" for name in ("twin_and_log", "weights", "correlations")
     }
     shown = capsys.readouterr().out
-    assert "gap from" in shown and "c8" in shown and "RMS errors, held out" in shown
+    assert "gap from" in shown and "c8" in shown and "rotor_speed [rad/s], held out" in shown
 
 
 @pytest.mark.parametrize("name", ["config.json", "checkpoint.pt", "weights.pt", "metrics.json"])

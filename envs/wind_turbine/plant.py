@@ -50,6 +50,7 @@ STATES = (
     Signal(symbol=r"\tau_g", name="generator_torque", unit="N m", low=0.0, high=RATED_TORQUE),
     Signal(symbol=r"\beta", name="blade_pitch", unit="deg", low=0.0, high=GREATEST_PITCH),
 )
+ERROR_INTEGRAL = Signal(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0)
 FAST_SPEED = Signal(symbol=r"\omega_F", name="fast_generator_speed", unit="rad/s")
 """Seventh state of a turbine whose policy observes the speed above rated or its rate."""
 WIND = Signal(symbol="u", name="wind_speed", unit="m/s", low=CUT_IN_WIND)
@@ -80,26 +81,12 @@ def _ahead(lead: float) -> Measurement:
     return _of_wind(Signal(symbol=rf"u_{{+{lead:g}}}", name=name, unit="m/s", low=CUT_IN_WIND), Preview(0, lead))
 
 
+LEAST_SPEED, GREATEST_SPEED = RATED_GENERATOR_SPEED - 2.0 * GAMMA_1, RATED_GENERATOR_SPEED + GAMMA_1
+ABOVE_RATED = Signal(symbol=r"e_\omega", name="speed_above_rated", unit="rad/s", low=LEAST_SPEED, high=GREATEST_SPEED)
+SPEED_RATE = Signal(symbol=r"e_{\dot\omega}", name="speed_rate", unit="rad/s", low=-0.2 * GAMMA_1, high=0.2 * GAMMA_1)
 OF_FAST_SPEED = (
-    Measurement(
-        symbol=r"e_\omega",
-        name="speed_above_rated",
-        unit="rad/s",
-        low=RATED_GENERATOR_SPEED - 2.0 * GAMMA_1,
-        high=RATED_GENERATOR_SPEED + GAMMA_1,
-        read=Named(FAST_SPEED.name),
-        offset=RATED_GENERATOR_SPEED,
-        scale=GAMMA_1,
-    ),
-    Measurement(
-        symbol=r"e_{\dot\omega}",
-        name="speed_rate",
-        unit="rad/s",
-        low=-0.2 * GAMMA_1,
-        high=0.2 * GAMMA_1,
-        read=speed_rate,
-        scale=GAMMA_1,
-    ),
+    Measurement.of(ABOVE_RATED, Named(FAST_SPEED.name), offset=RATED_GENERATOR_SPEED, scale=GAMMA_1),
+    Measurement.of(SPEED_RATE, speed_rate, scale=GAMMA_1),
 )
 ERRORS = ("speed_error", "speed_error_integral")
 INSTRUMENTS = ("rotor_speed", "filtered_generator_speed", "filtered_wind_speed", "generator_torque", "blade_pitch")
@@ -179,9 +166,7 @@ class WindTurbine(Plant):
     inputs = (WIND,)
     measurements = (
         Measurement(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0, read=speed_error),
-        Measurement(
-            symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0, read=Named("speed_error_integral")
-        ),
+        Measurement.of(ERROR_INTEGRAL, Named(ERROR_INTEGRAL.name)),
         _of_state(0, RATED_ROTOR_SPEED, 0.2),
         _of_state(1, RATED_GENERATOR_SPEED, GAMMA_1),
         _of_state(2, 11.0, 3.0),

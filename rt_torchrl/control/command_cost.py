@@ -51,7 +51,7 @@ class PenalisedInterval(nn.Module):
     low: Tensor
     span: Tensor
 
-    def __init__(self, plant: Plant, closure: nn.Module, penalty: float):
+    def __init__(self, plant: Plant, closure: nn.Module, penalty: float = PENALTY):
         super().__init__()
         self.plant, self.closure = plant, closure
         low, high = bounds(plant.actions)
@@ -80,23 +80,14 @@ class CommandCost:
         plant: the physics.
         closure: closure of the system.
         hold: number m of control intervals for which a command is held.
-        penalty: weight w of the penalty.
         terminal: cost V after the window; None for none.
 
     Raises:
-        ValueError: if an action has no finite range, episodes of the plant may end early, the penalty is negative,
-            ``hold`` is below 1 or a weight is not in double precision.
+        ValueError: if an action has no finite range, episodes of the plant may end early, ``hold`` is
+            below 1 or a weight is not in double precision.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        closure: nn.Module,
-        *,
-        hold: int = 1,
-        penalty: float = PENALTY,
-        terminal: TerminalCost | None = None,
-    ):
+    def __init__(self, plant: Plant, closure: nn.Module, *, hold: int = 1, terminal: TerminalCost | None = None):
         require_double("closure", closure)
         low, high = bounds(plant.actions)
         unbounded = [a.name for a, span in zip(plant.actions, (high - low).tolist(), strict=True) if span == torch.inf]
@@ -111,10 +102,8 @@ class CommandCost:
             )
         if hold < 1:
             raise ValueError(f"hold={hold} must be at least 1 control interval.")
-        if not 0.0 <= penalty < torch.inf:
-            raise ValueError(f"penalty={penalty} must be finite and not negative.")
         self.plant, self.hold, self.terminal = plant, hold, terminal
-        self.interval = PenalisedInterval(plant, closure, penalty)
+        self.interval = PenalisedInterval(plant, closure)
         self._low, self._span = low.numpy(), (high - low).numpy()
         self._code: IntervalCode | None = None
 
