@@ -81,7 +81,6 @@ class Rollout:
         self._costed = CostInterval(self.interval)
         self.engine = engine
         self._engine = ENGINES[engine](compiled=compiled)
-        self._driven: tuple[object, Drive, list[Tensor]] | None = None
 
     def __call__(
         self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0
@@ -133,23 +132,7 @@ class Rollout:
             require_pure_once(interval, initial_state, drive)
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:
-        """The drive, after a check of everything; that of the last call if the same tensors come again.
-
-        A planner asks many times for one scenario. The drive shares the memory of the tensors, so that their numbers
-        are always the present ones. Nothing is kept of tensors by which something is differentiated.
-        """
-        tensors = [x for x in (initial_state, exogenous, command, start) if isinstance(x, Tensor)]
-        stamps = [(id(x), x.data_ptr(), x.is_inference() or x._version) for x in tensors]
-        key = self.plant.dt, None if isinstance(start, Tensor) else start, stamps
-        differentiated = any(x.requires_grad for x in tensors)
-        if self._driven is not None and self._driven[0] == key and not differentiated:
-            return self._driven[1]
-        self._validate(initial_state, exogenous, command)
-        drive = drive_of(self.plant, exogenous, command, start=start)
-        self._driven = None if differentiated else (key, drive, tensors)
-        return drive
-
-    def _validate(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None) -> None:
+        """The drive, after a check of everything."""
         plant, batch, n = self.plant, initial_state.shape[0], exogenous.shape[1] if exogenous.ndim == 3 else -1
         expected = {
             "initial_state": (initial_state, (batch, len(plant.states))),
@@ -170,6 +153,7 @@ class Rollout:
                 )
             if not all_finite(value):
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
+        return drive_of(plant, exogenous, command, start=start)
 
 
 def refusal(engine: Engine, plant: Plant) -> str | None:
