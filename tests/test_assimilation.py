@@ -21,10 +21,9 @@ from rt_torchrl.steps.assimilate import Assimilation, FirstStates, SensorAssimil
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.hypotheses.ensemble import make_twin
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin, Sensitivities
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 WINDS = (1.0, -2.0)
 
@@ -188,30 +187,12 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
 
 
-def test_sensitivities_start_at_their_own_time():
-    """Two pieces together have the sensitivities of each alone."""
-    plant, record = Seasonal(), flight(Seasonal())
-    pieces = torch.tensor([0.0, 2.5], dtype=torch.float64)
-    rows = [(record.states[k], record.exogenous[k : k + 25], record.actions[k : k + 25]) for k in (0, 25)]
-    sensitivities = Sensitivities(plant, LinearClosure(torch.zeros(2, 2)))
-    together = sensitivities(*(torch.stack(x) for x in zip(*rows, strict=True)), start=pieces)
-    for b, row in enumerate(rows):
-        alone = sensitivities(*(x[None] for x in row), start=pieces[b].item())
-        for one, other in zip(together, alone, strict=True):
-            torch.testing.assert_close(one[b], other[0], rtol=1e-12, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("segment", "message"), [(-1, "segment=-1"), (51, "segment=51 of the assimilation exceeds the 50")]
 )
 def test_a_bad_segment_is_refused(segment, message):
     with pytest.raises(ValueError, match=message):
         of_segments(LinearQuadratic(), LinearClosure(torch.zeros(2, 2)), segment=segment)
-
-
-def test_a_plant_without_inputs_has_an_empty_process():
-    process = ExogenousProcess(torch.zeros(20, 0).double(), dt=0.1, signals=())
-    assert process.sample(3, torch.Generator()).shape == (3, 20, 0)
 
 
 NONE = HypothesesConfig()
@@ -270,13 +251,6 @@ def test_first_states_follow_from_what_is_read():
     assert guess[0].item() == pytest.approx(record.states[0, 0].item(), abs=0.02)
     assert guess[1:].tolist() == pytest.approx(record.states[0, 1:].tolist())
     assert first.spread[1] == 0.0 and 0.0 < first.spread[0] < 0.02 and first.spread[2] == torch.inf
-
-
-def test_a_turbine_needs_its_rotor_speed_alone():
-    plant = WindTurbine(horizon=60.0)
-    spread = FirstStates(plant, sensors_of(plant, ["rotor_speed"])).spread
-    # The wind's filter and the integral begin with the same value; the torque is a kinked function of the speed.
-    assert spread[[1, 2, 3, 5]].tolist() == [0.0] * 4
 
 
 def test_nothing_is_fitted_in_no_iteration_and_a_start_from_nonsense_begins_anew():

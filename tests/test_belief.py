@@ -1,4 +1,4 @@
-"""The belief about what policies cost on the real system, the alarm, and what is judged by both."""
+"""The belief about what policies cost on the real system, the alarm, and the referees that judge by both."""
 
 import copy
 import math
@@ -18,7 +18,7 @@ from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.learn import Learn
 from rt_torchrl.steps.report import findings
-from rt_torchrl.steps.switch import Evidence, ExpectedCost
+from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
@@ -84,20 +84,21 @@ def gaussian_process(distances, d, amplitude, noise):
     return k[0, 1:] @ solved[:, 0], k[0, 0] - k[0, 1:] @ solved[:, 1]
 
 
-def test_the_expected_cost_is_that_of_a_gaussian_process():
-    found, policy = belief_of((2.0, 0.9), (2.03, 0.8), (5.0, 0.0)), LinearGain([[2.01, 0.0]])
-    expected = found.expected(policy, 2.01)
-    positions = torch.stack([RECORD.states[:-1, 0]] * 1).square().mean().sqrt().item()  # of actions on a unit gain
-    at = np.array([2.01, 2.0, 2.03, 5.0])
+@pytest.mark.parametrize("gain", [2.01, 3.5])
+def test_the_expected_cost_is_that_of_a_gaussian_process(gain):
+    """Of a policy near two that have flown, and of one that hardly any flight tells of, whose variance counts."""
+    found, policy = belief_of((2.0, 0.9), (2.03, 0.8), (5.0, 0.0)), LinearGain([[gain, 0.0]])
+    positions = RECORD.states[:-1, 0].square().mean().sqrt().item()  # of actions on a unit gain
+    at, d = np.array([gain, 2.0, 2.03, 5.0]), np.array([0.9, 0.8, 0.0])
     distances = np.abs(at[:, None] - at[None]) * positions / 2.0  # in shares of half the range, ±2
     likelihoods = []
     for amplitude in np.linspace(0.02, 2.0, 400):
         k = amplitude**2 * (COMMON + (1.0 - COMMON) * np.exp(-0.5 * (distances[1:, 1:] / LENGTH) ** 2))
         k += NOISE**2 * np.eye(3)
-        d = np.array([0.9, 0.8, 0.0])
         likelihoods.append((d @ np.linalg.solve(k, d) + np.linalg.slogdet(k)[1], amplitude))
-    mean, variance = gaussian_process(distances, np.array([0.9, 0.8, 0.0]), min(likelihoods)[1], NOISE)
-    assert expected == pytest.approx(2.01 * math.exp(mean + 0.5 * variance), rel=0.01)
+    mean, variance = gaussian_process(distances, d, min(likelihoods)[1], NOISE)
+    assert gain == 2.01 or variance > 0.1
+    assert found.expected(policy, gain) == pytest.approx(gain * math.exp(mean + 0.5 * variance), rel=0.01)
 
 
 def test_a_policy_that_flew_is_known_and_a_twin_that_has_been_right_keeps_the_word():
@@ -108,17 +109,6 @@ def test_a_policy_that_flew_is_known_and_a_twin_that_has_been_right_keeps_the_wo
     right = belief_of((4.0, 0.01), (3.0, -0.02))
     assert right.expected(LinearGain([[1.0, 0.0]]), 1.0) == pytest.approx(1.0, rel=0.01)
     assert belief_of().expected(LinearGain([[1.0, 0.0]]), 1.0) == 1.0
-
-
-def test_what_is_known_of_one_exploring_episode_is_less():
-    known = [belief_of((4.0, 1.0), exploration=x).expected(LinearGain([[4.0, 0.0]]), 4.0) for x in (0.0, 0.1, 0.5)]
-    assert known[0] > known[1] > known[2] > 4.0
-
-
-def test_a_twin_that_blew_up_makes_no_neighbour_much_cheaper():
-    """The twin says 40 of a flight that cost 0.54; d counts as −1."""
-    found = belief_of((40.0, -4.3), (40.0, -4.3))
-    assert found.expected(LinearGain([[40.0, 0.0]]), 40.0) == pytest.approx(40.0 / math.e, rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -334,3 +324,91 @@ def test_a_clone_replaces_weights_that_flights_refute(corrects, kept):
     imitation.imitate = exactly
     report = imitation.clone(live, idle, seen=lambda: torch.zeros(1, 2), record=RECORD, judged_on=EPISODES)
     assert said(idle) == kept and ("reason" in report) == (not corrects)
+
+
+# The decision tree of step 6, table-tested on scripted costs.
+
+
+WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
+MOVING, STALLED = 0.9, 0.1
+
+
+def evidence(live_cost, idle_cost, change):
+    return Evidence(live_cost=live_cost, idle_cost=idle_cost, idle_weight_change=change)
+
+
+def play(config, script, live="model_free"):
+    """Events and counters of a script of ((live cost, idle cost), weight change)."""
+    referee, found = DecisionTree(config, live=live), []
+    for costs, change in script:
+        event = referee.decide(evidence(*costs, change))
+        found.append((event, referee.worse_count, referee.stall_count))
+    return found, referee
+
+
+@pytest.mark.parametrize(
+    "script, expected",
+    [
+        # Worse: C_π counts, and the third time in a row exceeds P_π = 2.
+        ([(WORSE, MOVING)] * 4, [("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0), ("keep", 1, 0)]),
+        # A better episode in between restarts C_π.
+        (
+            [(WORSE, MOVING)] * 2 + [(BETTER, MOVING)] + [(WORSE, MOVING)] * 3,
+            [("keep", 1, 0), ("keep", 2, 0), ("keep", 0, 0), ("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0)],
+        ),
+        # Better and stalled: C_w counts, and the fourth time in a row exceeds P_w = 3.
+        (
+            [(BETTER, STALLED)] * 5,
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("clone", 0, 0), ("keep", 0, 1)],
+        ),
+        # Movement restarts C_w.
+        (
+            [(BETTER, STALLED)] * 3 + [(BETTER, MOVING), (BETTER, STALLED)],
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 0, 0), ("keep", 0, 1)],
+        ),
+        # So does a worse live policy: the branch of the clone is not reached, stalled or not.
+        (
+            [(BETTER, STALLED)] * 3 + [(WORSE, STALLED), (BETTER, STALLED)],
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 1, 0), ("keep", 0, 1)],
+        ),
+        # Equal costs are not worse; a change equal to T_w is no stall.
+        ([(EQUAL, MOVING), (EQUAL, 0.5), (EQUAL, 0.4999)], [("keep", 0, 0), ("keep", 0, 0), ("keep", 0, 1)]),
+        # An infinite cost is worse than any other.
+        ([((math.inf, 1.0), MOVING), ((1.0, math.inf), MOVING)], [("keep", 1, 0), ("keep", 0, 0)]),
+    ],
+)
+def test_every_branch(script, expected):
+    assert play(RefereeConfig(), script)[0] == expected
+
+
+@pytest.mark.parametrize("patience", [0, 1, 4])
+def test_swap_and_clone_need_more_than_their_patience(patience):
+    config = RefereeConfig(patience=patience, clone_patience=patience)
+    for costs, event in ((WORSE, "swap"), (BETTER, "clone")):
+        events = [e for e, *_ in play(config, [(costs, STALLED)] * (2 * patience + 2))[0]]
+        assert events == (["keep"] * patience + [event]) * 2
+
+
+@pytest.mark.parametrize("live, other", [("model_free", "model_based"), ("model_based", "model_free")])
+def test_roles_exchange_and_only_by_a_swap(live, other):
+    referee = play(RefereeConfig(), [(WORSE, MOVING)] * 2, live)[1]
+    assert (referee.live, referee.idle) == (live, other)
+    referee.decide(evidence(*WORSE, MOVING))
+    assert (referee.live, referee.idle) == (other, live)
+    referee = play(RefereeConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
+    assert (referee.live, referee.idle) == (live, other)
+
+
+@pytest.mark.parametrize("live_cost, event", [(0.99, "keep"), (1.0, "keep"), (1.01, "swap")])
+def test_the_live_policy_is_worse_where_it_costs_more(live_cost, event):
+    assert DecisionTree(RefereeConfig(patience=0)).decide(evidence(live_cost, 1.0, MOVING)) == event
+
+
+@pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "idle_weight_change"])))
+def test_nan_is_refused_and_leaves_the_counters(position, name):
+    referee = play(RefereeConfig(), [(WORSE, MOVING)])[1]
+    arguments = [1.0, 1.0, 1.0]
+    arguments[position] = math.nan
+    with pytest.raises(ValueError, match=f"{name} of step 6 is NaN"):
+        referee.decide(evidence(*arguments))
+    assert (referee.live, referee.worse_count, referee.stall_count) == ("model_free", 1, 0)

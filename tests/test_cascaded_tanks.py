@@ -56,12 +56,6 @@ def _still():
     return torch.zeros(1).double(), torch.full((1,), 5.0).double()
 
 
-def test_the_sensor_ends_at_ten_volts():
-    plant = CascadedTanks(observe=("sensed_level", "level_error"))
-    seen = plant.observe(torch.tensor(0.0), torch.tensor([20.0, 10.5]).double(), torch.tensor([6.0]).double())
-    assert seen.tolist() == pytest.approx([2.5, -2.25])
-
-
 def test_a_perceptron_moves_water_and_makes_none_in_between():
     closure = NeuralHydraulics(Hydraulics.true(), hidden=(3,), generator=torch.Generator().manual_seed(0))
     features = torch.tensor([[15.0, 5.0, 3.0], [28.0, 9.0, 6.0]]).double()

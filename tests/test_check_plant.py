@@ -1,6 +1,5 @@
 """Every kind of violation of a plant's contract is found, in plants broken on purpose, and told with its remedy."""
 
-import math
 import re
 
 import fresh_process
@@ -10,7 +9,6 @@ from broken_plants import BROKEN, TRACED, partly_detached
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl import PlantContractError, check_plant
-from rt_torchrl.contract.gradients_and_tracing import amplification, stable_step
 
 
 def violations(plant, **options):
@@ -75,16 +73,6 @@ def test_the_check_leaves_no_trace():
     check_plant(plant, traced=False)
     assert torch.equal(plant.closure.matrix, before)
     assert torch.equal(torch.random.get_rng_state(), numbers)
-
-
-def test_limits_of_the_runge_kutta_step():
-    """The published ends of the stability region, on the real and on the imaginary axis."""
-    for direction, limit in ((-1.0, 2.78529), (1j, math.sqrt(8.0))):
-        z = torch.tensor([0.999 * limit * direction, 1.001 * limit * direction], dtype=torch.complex128)
-        inside, outside = amplification(z).tolist()
-        assert inside <= 1.0 < outside
-    # Found to 5 %.
-    assert 0.95 * 0.0278529 < stable_step(torch.tensor(-100.0, dtype=torch.complex128), 0.2) <= 0.0278529
 
 
 TRACE = """

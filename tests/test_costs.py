@@ -152,16 +152,6 @@ def test_rewards_sum_to_the_cost_by_steps_and_by_machine_code(tank):
     torch.testing.assert_close(-episode["next", "reward"][..., 0].mean(-1), found, rtol=1e-9, atol=0.0)
 
 
-def test_a_terminal_cost_must_fulfil_the_contract(tank):
-    class Negative(CryogenicTank):
-        def terminal_cost(self, state):
-            return -(state[..., 2] ** 2)
-
-    check_plant(tank, episodes=2, steps=10, traced=False)
-    with pytest.raises(ValueError, match="terminal_cost: is -"):
-        check_plant(Negative(horizon=900.0), episodes=2, steps=10, traced=False)
-
-
 def test_an_optimal_vent_goes_on_until_the_end_where_the_end_has_a_price():
     """Of constant openings in the last hours, the cheapest is shut where nobody pays for the end, else open."""
     ends = []

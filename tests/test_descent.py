@@ -1,4 +1,4 @@
-"""Gradient descent of steps 4 and 5 on costs with known minima."""
+"""Gradient descent of steps 4 and 5 on costs with known minima, and the mean that limits exploding gradients."""
 
 import copy
 import math
@@ -110,15 +110,6 @@ def test_gradients_are_counted_exactly(optimiser, iterations):
     cost = Bowl(point)
     found = Descent(point, DescentConfig(optimiser=optimiser, rate=0.1)).run(rosenbrock, iterations)
     assert found.iterations == cost.with_gradient == iterations
-
-
-@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
-def test_no_iterations_do_nothing(optimiser):
-    point = Point((3.0, 3.0, 3.0))
-    cost = Bowl(point)
-    found = Descent(point, DescentConfig(optimiser=optimiser)).run(cost, 0)
-    assert found.iterations == 0 and cost.with_gradient == 0
-    assert torch.equal(point.at.detach(), torch.full((3,), 3.0, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])

@@ -11,7 +11,6 @@ from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_hh, read_wind
 
@@ -46,17 +45,6 @@ def test_every_periodogram_is_the_spectrum(n):
         assert power[:, -1].mean() == pytest.approx(kaimal(f[-1]), rel=5 / math.sqrt(2 * 256))
 
 
-@pytest.mark.parametrize("n", [7, 8])
-def test_inverse_fft_is_the_sum_of_cosines(n):
-    """The definition, summed term by term with the same phases; at even n the last term is the Nyquist frequency."""
-    wind = KaimalWind(floor=-math.inf, scale_to_target=False).draw(5, n, DT, seeded(4)).numpy()
-    f = np.arange(1, n // 2 + 1) / (n * DT)
-    phase = 2 * np.pi * torch.rand(5, len(f), generator=seeded(4), dtype=torch.float64).numpy()
-    cosines = np.cos(2 * np.pi * f[:, None] * DT * np.arange(n) + phase[..., None])
-    expected = MEAN + (np.sqrt(2 * kaimal(f) / (n * DT))[:, None] * cosines).sum(1)
-    np.testing.assert_allclose(wind, expected, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize("scale", [True, False])
 def test_each_sample_has_its_mean_and_deviation(scale):
     winds = KaimalWind(floor=-math.inf, scale_to_target=scale).draw(64, N, DT, seeded(6))
@@ -69,18 +57,6 @@ def test_each_sample_has_its_mean_and_deviation(scale):
     # The Nyquist bin, with 3.4e-5 of σ², is random, S Δf (1 + cos 2φ), and moves variance and factor that little.
     np.testing.assert_allclose(winds.var(-1, correction=0), factor * band, rtol=2e-12 if scale else 5e-5)
     np.testing.assert_allclose(power[:, :-1], np.broadcast_to(factor * kaimal(f)[:-1], (64, N // 2 - 1)), rtol=5e-5)
-
-
-def test_marginal_is_nearly_gaussian():
-    """A sum of m cosines with random phases has no skewness and an excess kurtosis of −1.5 Σa⁴/(Σa²)²."""
-    n_seeds, n = 20_000, 300
-    sample = KaimalWind(floor=-math.inf, scale_to_target=False).draw(n_seeds, n, DT, seeded(10))[:, 0].numpy()
-    power = kaimal(np.arange(1, n // 2 + 1) / (n * DT))
-    excess = -1.5 * (power**2).sum() / power.sum() ** 2
-    z = (sample - MEAN) / sample.std()
-    # Five standard errors, √(6/N) and √(24/N) for independent near-Gaussian samples.
-    assert (z**3).mean() == pytest.approx(0.0, abs=5 * math.sqrt(6 / n_seeds))
-    assert (z**4).mean() - 3.0 == pytest.approx(excess, abs=5 * math.sqrt(24 / n_seeds))
 
 
 def test_floor_cuts_what_lies_below_it_and_no_turbulence_is_steady():
@@ -260,16 +236,6 @@ def test_a_giant_size_is_refused_without_memory_for_it(tmp_path, offset):
     assert peak_memory(read) < 1e6
 
 
-def test_a_field_is_not_read_as_a_whole(tmp_path):
-    """The file holds 64 MB of zeros, of which the hub needs 8 kB in each of four columns."""
-    path, (content, _) = tmp_path / "field.bts", bts_bytes(plane()[1], n_tower=0)
-    sizes = struct.pack("<4i", 103, 104, 0, 1000)
-    with path.open("wb") as file:
-        file.write(content[:2] + sizes + content[18:79])
-        file.truncate(79 + 2 * 3 * 103 * 104 * 1000)
-    assert peak_memory(lambda: read_wind(path)) < 1e6
-
-
 def test_wind_has_the_mean_and_covariance_of_the_process():
     draws, n, dt = 20_000, 26, 0.2
     gust = GaussianGust(mean=1.5, std=0.8, time_scale=0.9)
@@ -278,21 +244,6 @@ def test_wind_has_the_mean_and_covariance_of_the_process():
     # Standard errors are σ/√N = 0.0057 and at most σ²√(2/N) = 0.0064; four of them.
     np.testing.assert_allclose(wind.mean(0), 1.5, atol=0.023)
     np.testing.assert_allclose(np.cov(wind.T), 0.64 * np.exp(-0.5 * (lag / 0.9) ** 2), atol=0.026)
-
-
-def test_default_wind_is_the_papers():
-    wind = FlappingWing(dt=2.5e-3).draw_exogenous(4000, seeded(2))[:, ::400, 0]
-    # One standard error is 0.016 for the mean and 0.022 for the variance, at each of the five times.
-    torch.testing.assert_close(wind.mean(0), torch.ones(5, dtype=torch.float64), rtol=0, atol=0.064)
-    torch.testing.assert_close(wind.var(0), torch.ones(5, dtype=torch.float64), rtol=0, atol=0.09)
-    correlation = torch.corrcoef(wind.T)[0]
-    expected = torch.exp(-0.5 * (torch.arange(5, dtype=torch.float64) / 3.0) ** 2)
-    torch.testing.assert_close(correlation, expected, rtol=0, atol=0.064)
-
-
-def test_finer_sampling_is_the_same_gust():
-    coarse, fine = (GaussianGust().draw(2, n, 5.0 / n, seeded()) for n in (100, 1000))
-    torch.testing.assert_close(fine[:, ::10], coarse, rtol=0, atol=1e-13)
 
 
 def test_load_statistics():

@@ -50,13 +50,6 @@ def test_a_controller_of_another_kind_of_episodes_is_refused():
         RealEpisodes(connected(plant), 2).fly_baseline(PD(plant))
 
 
-def test_without_a_true_closure_nothing_is_flown_in_simulation():
-    unseen = UnseenEpisodes(LinearQuadratic(), 2)
-    unseen.closure = None
-    with pytest.raises(ValueError, match="the true closure of plant 'linear_quadratic' is not known"):
-        unseen.fly(LinearGain(optimal_gain(1.0)))
-
-
 LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582
 EPISODES, SEED = 8, 12345
 

@@ -190,19 +190,3 @@ def test_large_scales_are_mixed_from_the_third_episode_on():
     assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
     low, high = plant.inputs[0].low, plant.inputs[0].high
     assert (seen[3] >= low).all() and (seen[3] <= high).all()
-
-
-def test_seed_fixes_the_samples():
-    found = process(autoregressive(100, 0.5))
-    first = found.sample(2, seeded(1))
-    torch.manual_seed(7)
-    assert torch.equal(first, found.sample(2, seeded(1))) and not torch.equal(first, found.sample(2, seeded(2)))
-
-
-def test_a_record_of_14_400_points_needs_no_dense_matrix():
-    """A dense covariance alone would take 1.7 GB per component; the FFT of 28 800 points takes a megabyte."""
-    found = process(autoregressive(14_400, 0.9))
-    drawn = found.sample(2, seeded())
-    assert drawn.shape == (2, 14_400, 1) and drawn.isfinite().all()
-    # Time averages of one path; correlation time of 19 steps: 760 independent values, 5 % of a variance, five of them.
-    assert (drawn - found.mean).var().item() == pytest.approx(found.covariance[0, 0, 0].item(), rel=0.25)

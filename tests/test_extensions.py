@@ -1,5 +1,7 @@
 """Plants with dynamics beside their own: against closed forms, and in every part that flies them."""
 
+import math
+
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -9,6 +11,7 @@ from torch import nn
 
 from rt_torchrl import check_plant
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
+from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.extension import ExtendedClosure, Extension
 from rt_torchrl.plants.plant import PARTS, Plant
 from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations, UnreadInput
@@ -97,14 +100,11 @@ def test_a_delay_gives_what_was_asked_for_earlier():
     assert torch.equal(flown.actions, command)  # the actuators believe that they did what they were asked for
 
 
-def test_the_response_of_a_chain_has_its_mean_delay():
-    plant = LaggedActuator(LinearQuadratic(dt=0.01), "force", 0.3, stages=5)
-    x, step = torch.zeros(5, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    missing = 0.0
-    for _ in range(500):
-        mean, x = plant.respond(x, step, plant.closure)
-        missing += (1.0 - mean.item()) * 0.01
-    assert missing == pytest.approx(0.3, rel=1e-6)
+def test_a_coefficient_stays_within_its_factor_whatever_the_weight():
+    own = PositiveCoefficients([2.0], names={"lag": "s"}, factor=10.0)
+    for weight, expected in ((0.0, 2.0), (0.5, 2.0 * 10.0 ** math.tanh(0.5)), (50.0, 20.0), (-50.0, 0.2)):
+        own.weights.data.fill_(weight)
+        assert own.named_coefficients()["lag"].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import trapezoid
-from scipy.optimize import brentq, fsolve
+from scipy.optimize import fsolve
 from seeds_and_numbers import double, seeded
-from torch import nn
 
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
@@ -63,22 +62,6 @@ class Converged(FlappingWing):
     smallest_airspeed = 1e-9
 
 
-class NoForce(nn.Module):
-    def forward(self, features):
-        return torch.zeros_like(features)
-
-
-class WithWeights(nn.Module):
-    """A polar with other weights, as an argument to differentiate by."""
-
-    def __init__(self, polar, weights):
-        super().__init__()
-        self.polar, self.weights = polar, weights
-
-    def forward(self, features):
-        return torch.func.functional_call(self.polar, {"log_coefficients": self.weights}, features)
-
-
 @pytest.fixture(scope="module")
 def plant():
     return FlappingWing()
@@ -123,10 +106,6 @@ def test_mean_lift_over_weight(plant, amplitude, lift):
     assert abs(F_x) < 1e-12  # half-strokes mirror each other
 
 
-def test_hover_amplitude(plant):
-    assert brentq(lambda A: mean_force(plant, A)[1] - 1.0, 60.0, 88.0) == pytest.approx(77.2, abs=0.2)
-
-
 def test_a_heavier_body_is_moved_by_the_same_forces(plant):
     state, action, wind = double(0.0, 0.0, 0.3, -0.2), double(77.0, -5.0), double(1.0)
     heavier = FlappingWing(mass=1.25 * MASS)
@@ -164,29 +143,6 @@ def test_forces_are_those_of_the_matrices_and_the_arc_cosine(model, tolerance):
         expected = reference_force(t, velocity, amplitude, angle, wind)
         error = np.linalg.norm(MASS * (rate[2:].numpy() + [0.0, GRAVITY]) - expected)
         assert error < tolerance * max(WEIGHT, np.linalg.norm(expected))
-
-
-def test_without_wings_the_body_falls_at_its_terminal_speed():
-    plant = FlappingWing(closure=NoForce())
-    terminal = math.sqrt(2 * WEIGHT / (RHO * 5e-4))
-    rate = plant.vector_field(
-        double(0.01).squeeze(), double(0.0, 0.0, -1.0, -terminal), double(70.0, 5.0), double(1.0), NoForce()
-    )
-    # The floor ε of the airspeed adds (ε/U)²/2 = 5e-7 of the drag.
-    torch.testing.assert_close(rate[2:], double(0.0, 0.0), rtol=0, atol=1e-5)
-
-
-def test_gradients_of_the_vector_field():
-    plant, polar = FlappingWing(), QuasiSteadyPolar.draw(seeded())
-    t = double(0.0, 0.013, 1.321)
-    state = torch.randn(3, 4, generator=seeded(1), dtype=torch.float64)
-    action, wind = double(60.0, -20.0, 77.0, 0.0, 85.0, 25.0).view(3, 2), double(1.0, -0.5, 2.0).view(3, 1)
-    inputs = [x.requires_grad_() for x in (t, state, action, wind)]
-
-    def field(t, state, action, wind, weights):
-        return plant.vector_field(t, state, action, wind, WithWeights(polar, weights))
-
-    assert torch.autograd.gradcheck(field, (*inputs, polar.log_coefficients))
 
 
 def test_still_air_on_a_resting_wing_is_differentiable(plant):
@@ -234,14 +190,6 @@ def test_first_guess_of_the_polar_is_within_half_of_the_truth(plant):
     assert not any(weight.requires_grad for weight in plant.parameters())
 
 
-def test_policy_has_the_papers_ten_weights_and_stays_in_range(plant):
-    policy = plant.make_policy(seeded())
-    assert sum(weight.numel() for weight in policy.parameters()) == 10
-    observation = 10.0 * torch.randn(50, 4, generator=seeded(), dtype=torch.float64)
-    A_phi, beta_w = policy(observation).unbind(-1)
-    assert ((A_phi >= 50) & (A_phi <= 88) & (beta_w.abs() <= 30)).all()
-
-
 # Control problem
 
 
@@ -270,11 +218,3 @@ def test_cost(state, peak, cost):
 def test_discrepancy_is_of_positions_only(plant):
     value = plant.discrepancy(double(1.0, 2.0, 9.0, 9.0), double(4.0, 6.0, 0.0, 0.0))
     assert value.item() == 12.5
-
-
-def test_episodes_start_at_rest_in_the_origin(plant):
-    assert plant.n_steps == 10_000
-    assert torch.equal(plant.draw_initial_state(3, seeded()), torch.zeros(3, 4, dtype=torch.float64))
-    wind = plant.draw_exogenous(3, seeded())
-    assert wind.shape == (3, 10_000, 1)
-    assert torch.equal(wind, plant.draw_exogenous(3, seeded()))

@@ -6,13 +6,12 @@ import ctypes
 import functools
 import gc
 import hashlib
-import subprocess
-import sys
 import threading
 import types
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 
+import fresh_process
 import numpy as np
 import pytest
 import torch
@@ -259,9 +258,7 @@ print(found[0])
 
 
 def second(*arguments):
-    return subprocess.run(
-        [sys.executable, "-c", SECOND, *map(str, arguments)], capture_output=True, text=True, check=False
-    )
+    return fresh_process.run(SECOND, *map(str, arguments))
 
 
 def test_other_processes_write_at_once_and_load_what_is_kept(folder, compilations):

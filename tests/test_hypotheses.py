@@ -11,7 +11,7 @@ from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, progress, twin_entries
+from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, twin_entries
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (
@@ -159,16 +159,6 @@ def test_an_episode_reports_the_twin_that_is_believed():
     assert entries["closure"] != named_weights(twin.closure)
 
 
-def test_a_believed_twin_that_diverges_on_the_records_says_so():
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
-    with torch.no_grad():
-        twin.twins["lags"].closure.base.matrix.fill_(1e3)
-    report = assimilation.report()
-    assert report["believed"] == "lags" and report["J_p"] == float("inf")
-    record = {"episode": 0, "real_cost": 1.0, "live": "model_based", "J_a_model_based": float("nan"), **report}
-    assert progress(record).startswith("RMS position diverges, velocity diverges, J_a mb not computed, real 1,")
-
-
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
     twin, _ = fitted(PLANT, PLANT)
     policy = LinearGain([[1.0, 1.0]])
@@ -206,18 +196,6 @@ def test_the_results_say_what_the_twin_lacks():
     assert found["late"] == {"weight": 0.3, "weights": {}, "described": {}}
     lines = hypothesis_lines(found)
     assert lines == ["  beside the twin: lags, weight 0.60, force_lag = 0.2 s", "  beside the twin: late, weight 0.30"]
-
-
-def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
-    twin, _ = ensemble(PLANT)
-    twin.weights = {"late": 0.9, ALONE: 0.1}
-    generator = torch.Generator().manual_seed(0)
-    state, exogenous = PLANT.draw_initial_state(2, generator), PLANT.draw_exogenous(2, generator)
-    flown = twin.control(LinearGain([[1.0, 1.0]]), state, exogenous)
-    late = twin.twins["late"]
-    expected = late.control(LinearGain([[1.0, 1.0]]), late.plant.at_rest(state), exogenous)
-    assert flown.states.shape == (2, PLANT.n_steps + 1, 2)
-    torch.testing.assert_close(flown.states, expected.states[..., :2])
 
 
 def kept(misfits):

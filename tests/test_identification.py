@@ -11,13 +11,11 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
 
-from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
-from rt_torchrl.fit.log import SensorLog, checked
-from rt_torchrl.fit.resampling import filled, hold_out, initial_spread, logged_readings, resample, sensors_in
+from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
@@ -60,20 +58,6 @@ def test_the_likelihood_of_the_states_with_the_noise_of_their_scales_is_the_cost
     # The same derivatives, forward instead of backward: rounding over 39 steps.
     assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
-
-
-def test_a_segment_is_replayed_on_the_plants_clock():
-    """The drone's wing beat has a phase: the true twin replays a later part only if it starts at its own time."""
-    plant = FlappingWing(horizon=0.06)
-    _, second = flown(plant, torch.Generator().manual_seed(0), (33, 60))
-    twin, names = DigitalTwin(plant, QuasiSteadyPolar.true().requires_grad_(True)), [s.name for s in plant.states]
-    errors = []
-    for start in (second.start, 0.0):
-        sensors = sensors_of(plant, names)
-        record = sensor_record(plant, sensors, second._replace(start=start))
-        (replayed,) = Estimation(twin, sensors).likelihood([record], torch.ones(4).double(), known=True).simulated()
-        errors.append((replayed - second.states).abs().max().item())
-    assert errors[0] < 1e-12 < 1e-4 < errors[1]
 
 
 def test_a_line_is_fitted_as_by_regression():
@@ -143,29 +127,6 @@ def test_a_twin_that_diverges_at_the_start_is_told():
     twin = DigitalTwin(plant, LinearClosure(torch.full((2, 2), 1e9)))
     with pytest.raises(DivergenceError, match="diverged .* at t = .* LinearClosure.* units of what was recorded"):
         identify(Estimation(twin, state_sensors(plant)), records, records)
-
-
-def test_a_log_with_rows_left_out_gives_the_true_weights_within_their_errors():
-    """A force that is drawn anew in every interval; in one row of twenty the log does not hold it."""
-    plant, generator = LinearQuadratic(horizon=60.0), torch.Generator().manual_seed(3)
-    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    force = 2.0 * torch.rand(1, plant.n_steps, 1, generator=generator, dtype=torch.float64).round() - 1.0
-    with torch.no_grad():
-        states = Rollout(plant, plant.closure)(start, wind, force).states[0]
-    states = (states + 0.003 * torch.randn(states.shape, generator=generator, dtype=torch.float64)).numpy()[:-1]
-    columns = {"position": states[:, 0], "velocity": states[:, 1], "disturbance": wind[0, :, 0].numpy()}
-    logged = force[0, :, 0].numpy().copy()
-    logged[7::20] = np.nan
-    log = SensorLog(times=plant.dt * np.arange(plant.n_steps), columns=columns | {"force": logged})
-    log = checked(log, plant, drop=True)
-    parts, sensors = resample(filled(log, plant), plant), sensors_in(plant, log)
-    records = [logged_readings(log, plant, sensors, part, parts.gap) for part in parts.segments]
-    twin = DigitalTwin(plant, LinearClosure(torch.zeros(2, 2)))
-    found = Estimation(twin, sensors, spread=initial_spread(plant, log), config=ROBUST).run(records)
-    errors = found.uncertainty.standard_errors()
-    for (name, value), true in zip(found.after.items(), np.ravel(plant.true_closure), strict=True):
-        # The errors are below 0.001; where a force is held over what it was not, they are 0.02.
-        assert abs(value - true) < 4.0 * errors[name] < 0.01
 
 
 class Joints(PositiveCoefficients):

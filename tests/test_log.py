@@ -65,14 +65,6 @@ def test_columns_are_converted_by_their_units(tmp_path):
         Column(header="x", signal="position", factor=2.0, unit="mm")
 
 
-def test_a_csv_file_is_read_in_the_signals_units(tmp_path):
-    (tmp_path / "log.csv").write_text(TABLE)
-    log = checked(read_log(tmp_path / "log.csv", PLANT, MAPPING), PLANT)
-    assert log.times.tolist() == pytest.approx([0.0, 0.1, 0.25])
-    assert log.columns["position"].tolist() == pytest.approx([3.0, 4.0, 5.0])
-    assert set(log.columns) == {"position", "velocity", "force", "disturbance"}
-
-
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_what_is_written_is_read_again(tmp_path, suffix):
     if suffix == "parquet":

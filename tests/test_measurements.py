@@ -61,12 +61,6 @@ def test_the_turbine_observes_by_hand():
     torch.testing.assert_close(plant.observe(TIME_ZERO, state, double(15.5)), expected)
 
 
-def test_names_and_sets_are_chosen_together_and_once():
-    plant = WindTurbine(observe=("wind_speed", "errors", "wind_speed", "speed_error"))
-    assert names(plant) == ["wind_speed", "speed_error", "speed_error_integral", "rotor_speed"]
-    assert names(WindTurbine()) == names(WindTurbine(observe=("paper",))) == ["speed_error", "speed_error_integral"]
-
-
 def test_the_phase_of_the_wing_beat():
     plant = FlappingWing(observe=("phase_cosine", "phase_sine"))
     t = double(0.0, 0.0125, 0.025)  # a beat lasts 0.05 s
@@ -115,14 +109,6 @@ def test_a_preview_is_the_wind_to_come_in_every_episode():
     for column, steps in ((1, 4), (2, 8), (3, 16)):
         assert torch.equal(wind[:, :-steps, column], base[:, steps:, 0])
         assert torch.equal(wind[:, -steps:, column], base[:, -1:, 0].expand(-1, steps))
-
-
-def test_a_preview_changes_nothing_of_the_turbine():
-    plant, plain = (WindTurbine(horizon=60.0, observe=(which,)) for which in ("preview", "paper"))
-    state, wind = plain.draw_initial_state(2, seeded()), plant.draw_exogenous(2, seeded())
-    command = double(3e4, 2.0).expand(2, plant.n_steps, 2)
-    found = Rollout(plant, plant.closure)(state, wind, command).states
-    torch.testing.assert_close(found, Rollout(plain, plain.closure)(state, wind[..., :1], command).states)
 
 
 def test_virtual_episodes_preview_their_own_wind():

@@ -1,6 +1,5 @@
 """Engine native against backpropagation, over plants, closures, policies, batches, lengths, threads and memory."""
 
-import math
 import warnings
 from collections import OrderedDict
 from contextlib import nullcontext
@@ -179,15 +178,6 @@ def test_a_weight_that_changes_before_the_backward_pass_is_noticed():
         ends.sum().backward()
 
 
-def test_without_gradients():
-    task = Task()
-    with torch.no_grad():
-        ends = NATIVE.end_states(task.interval, task.state, task.drive)
-        found = NATIVE.costs(CostInterval(task.interval), task.state, task.drive)
-    assert not ends.requires_grad and not found.requires_grad
-    assert_equal([ends, found], [task.gradients(NATIVE)[0], costs(task, NATIVE)[0]], 1e-14)
-
-
 def test_frozen_weights():
     task = Task()
     task.gradients(NATIVE)
@@ -278,15 +268,6 @@ def test_a_python_branch_has_the_gradient_of_the_branch_that_was_taken():
         gradients.append(torch.autograd.grad((flown.states**2).mean(), closure.matrix)[0])
     assert flown.states[..., 0].min() < 0.0 < flown.states[..., 0].max()  # both branches are taken
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=0.0)
-
-
-def test_states_that_leave_the_numbers_are_kept():
-    """0·∞ in the plant stays NaN, and ends of other realisations stay what they are."""
-    task = Task(batch=9, n=3)
-    with torch.no_grad():
-        task.state[4, 0], task.state[7, 1] = math.inf, math.nan
-        found, exact = (e.end_states(task.interval, task.state, task.drive) for e in (NATIVE, AUTOGRAD))
-    torch.testing.assert_close(found, exact, rtol=1e-13, atol=0.0, equal_nan=True)
 
 
 class Saturated(nn.Module):

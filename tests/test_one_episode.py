@@ -42,39 +42,17 @@ def counted(monkeypatch, owner, name):
     return calls
 
 
-def test_torchrl_is_in_the_path_that_runs_by_default(tmp_path, monkeypatch):
-    loss = counted(monkeypatch, DDPGLoss, "forward")
-    sample = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "sample")
-    refresh = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "update_tensordict_priority")
-    algorithm = trained(tmp_path).algorithm
-    assert isinstance(algorithm, TensorDictSequential) and isinstance(algorithm.collector, BaseCollector)
-    # TD errors of three flights, and one trace of the critic's iteration and of the policy's, replayed 400 times.
-    assert len(loss) == 3 + 2
-    assert len(sample) == 2 * 2 * 2  # of two episodes with two phases, fifty batches at once
-    assert len(refresh) == 3 + 2 * 2
-
-
-def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch):
-    calls = counted(monkeypatch, torchdiffeq, "odeint_adjoint")
-    trained(tmp_path / "native", seconds=10)
-    assert not calls
-    few = ("--twinning.planner.method", "single_start", "--twinning.planner.iterations", "1")
-    few += ("--twinning.planner.realisations", "1", "--twinning.assimilation.iterations", "1")
-    few += ("--twinning.virtual-episodes", "1")
-    trained(tmp_path / "continuous", "--engine", "odeint_adjoint", "--compiled", "False", *few, seconds=6)
-    assert len(calls) > 8  # one for every control interval
-
-
-def test_an_episode_goes_through_few_functions(tmp_path, monkeypatch):
+def functions_of_an_episode(monkeypatch):
+    """Functions of this library that the second episode calls, which traces nothing; a set of file and line."""
     seen, episode = set(), ReinforcementTwinning.episode
 
-    def watched(algorithm, *arguments):
-        def note(frame, event, _):
-            code = frame.f_code
-            if event == "call" and code.co_filename.startswith(HERE) and not code.co_name.startswith("<"):
-                seen.add((code.co_filename, code.co_firstlineno))
+    def note(frame, event, _):
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(HERE) and not code.co_name.startswith("<"):
+            seen.add((code.co_filename, code.co_firstlineno))
 
-        if algorithm.episodes_done == 1:  # the first one traces
+    def watched(algorithm, *arguments):
+        if algorithm.episodes_done == 1:
             sys.setprofile(note)
         try:
             return episode(algorithm, *arguments)
@@ -82,5 +60,28 @@ def test_an_episode_goes_through_few_functions(tmp_path, monkeypatch):
             sys.setprofile(None)
 
     monkeypatch.setattr(ReinforcementTwinning, "episode", watched)
-    trained(tmp_path)
-    assert 150 < len(seen) <= FUNCTIONS and len({file for file, _ in seen}) <= FILES
+    return seen
+
+
+def test_torchrl_is_in_the_path_that_runs_by_default_which_goes_through_few_functions(tmp_path, monkeypatch):
+    loss = counted(monkeypatch, DDPGLoss, "forward")
+    sample = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "sample")
+    refresh = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "update_tensordict_priority")
+    adjoint, functions = counted(monkeypatch, torchdiffeq, "odeint_adjoint"), functions_of_an_episode(monkeypatch)
+    algorithm = trained(tmp_path).algorithm
+    assert isinstance(algorithm, TensorDictSequential) and isinstance(algorithm.collector, BaseCollector)
+    # TD errors of three flights, and one trace of the critic's iteration and of the policy's, replayed 400 times.
+    assert len(loss) == 3 + 2
+    assert len(sample) == 2 * 2 * 2  # of two episodes with two phases, fifty batches at once
+    assert len(refresh) == 3 + 2 * 2
+    assert not adjoint
+    assert 150 < len(functions) <= FUNCTIONS and len({file for file, _ in functions}) <= FILES
+
+
+def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch):
+    calls = counted(monkeypatch, torchdiffeq, "odeint_adjoint")
+    few = ("--twinning.planner.method", "single_start", "--twinning.planner.iterations", "1")
+    few += ("--twinning.planner.realisations", "1", "--twinning.assimilation.iterations", "1")
+    few += ("--twinning.virtual-episodes", "1")
+    trained(tmp_path / "continuous", "--engine", "odeint_adjoint", "--compiled", "False", *few, seconds=6)
+    assert len(calls) > 8  # one for every control interval

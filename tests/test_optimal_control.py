@@ -11,9 +11,9 @@ from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, d
 from rt_torchrl.control.forecasts import Foreseen
 from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_start
+from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, random_start
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import constant
 
@@ -79,17 +79,6 @@ def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
     assert set(found.start_costs) == set(starts) and found.excess == 0.0
     assert found.gradient.max() < 1e-5
     torch.testing.assert_close(found.costs, control_cost(plant, found.flown))
-
-
-def test_starts_that_diverge_are_reported():
-    plant = LinearQuadratic(horizon=1.0)
-    state, exogenous = episodes(plant, 2)
-    nowhere = torch.full((2, plant.n_steps, 1), torch.nan, dtype=torch.float64)
-    middle = constant_starts(plant, 2, plant.n_steps)["constant 0.5"]
-    found = clairvoyant(plant, state, exogenous, {"nowhere": nowhere, "middle": middle})
-    assert found.start_costs["nowhere"].isinf().all() and found.start_costs["middle"].isfinite().all()
-    with pytest.raises(DivergenceError, match="diverges from every start: nowhere"):
-        clairvoyant(plant, state, exogenous, {"nowhere": nowhere})
 
 
 def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
@@ -213,11 +202,6 @@ def test_the_gradient_is_that_of_central_differences_before_and_after_a_charge()
             np.testing.assert_allclose(gradient[:, k, 0], slope, rtol=1e-5, atol=1e-6)
         found.append(costs)
     assert (np.abs(found[0] - found[1]) > 1e-3).all()  # the second has multipliers, too
-
-
-def test_only_actuators_with_limits_hold_commands_back():
-    for plant, limited in ((LinearQuadratic(), False), (RateLimited(), True)):
-        assert held_back(plant, plant.draw_initial_state(2, torch.Generator().manual_seed(0))) == limited
 
 
 class Untraceable(LinearQuadratic):

@@ -21,7 +21,6 @@ from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, senso
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -63,20 +62,6 @@ def test_a_step_is_gymnasiums(mass, length):
     # The stops of torque and speed have been met, and not everywhere.
     for stopped in (applied.abs() == 2.0, end[:, 1].abs() == 8.0):
         assert 5 < stopped.sum() < 495
-
-
-def test_a_whole_episode_is_gymnasiums():
-    """Two hundred steps of random torque; a rod near its upright position multiplies errors by e^4 in a second."""
-    plant = Pendulum()
-    state, commands = somewhere(1)[0], 2.0 * torch.rand(1, 200, 1, generator=seeded(1), dtype=torch.float64) - 1.0
-    flown = Rollout(plant, plant.closure)(state, torch.zeros(1, 200, 0).double(), commands)
-    env = gymnasium.make("Pendulum-v1").unwrapped
-    env.reset()
-    env.state = state[0].numpy().copy()
-    for command in commands[0].numpy():
-        env.step(command)
-    end = torch.from_numpy(env.state)
-    assert wrapped(flown.states[0, -1, 0] - end[0]).abs() < 1e-9 and (flown.states[0, -1, 1] - end[1]).abs() < 1e-9
 
 
 def test_the_real_system_reports_gymnasiums_reward_and_starts():

@@ -135,17 +135,6 @@ def test_a_time_in_another_unit_is_refused_before_memory_is_taken(unit, monkeypa
         resample(signals(0.1 * unit * np.arange(236)), PLANT)
 
 
-def test_previews_follow_from_the_input_and_need_no_column():
-    plant = WindTurbine(horizon=20.0, observe=("preview",))
-    wind, rows = 8.0 + 0.1 * np.arange(41), {"generator_torque": 2e4, "blade_pitch": 0.0, "rotor_speed": 1.0}
-    columns = {name: np.full(41, value) for name, value in rows.items()} | {"wind_speed": wind}
-    log = checked(SensorLog(times=plant.dt * np.arange(41), columns=columns), plant)
-    (segment,) = resample(log, plant).segments
-    ahead = round(2.0 / plant.dt)
-    np.testing.assert_allclose(segment.exogenous[:-ahead, 1], segment.exogenous[ahead:, 0])
-    assert hidden_states(plant, log) == []
-
-
 TESTS = Path(__file__).parent
 
 
@@ -201,13 +190,6 @@ def test_samples_between_rows_that_are_too_far_apart_are_missing():
 def test_what_does_not_fit_a_log_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         change(log_of(Room(), ["air"]), Room())
-
-
-def test_missing_values_of_the_drive_are_refused():
-    log = log_of(Room(), ["air"])
-    log.columns["heater"][3] = np.nan
-    with pytest.raises(ValueError, match="heater is nan W in row 3"):
-        checked(log, Room(), missing=True)
 
 
 @pytest.fixture

@@ -4,13 +4,10 @@ The theory, which made the table of the worn rotor, is held against an independe
 ideal rotor.
 """
 
-import inspect
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
-from blade_element import Blade, Polar, Rotor, power_coefficients, solve_inflow, worn_values
+from blade_element import Blade, Polar, Rotor, power_coefficients, worn_values
 from scipy.interpolate import RectBivariateSpline
 
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
@@ -43,14 +40,6 @@ def test_optimum_at_fine_pitch(table):
     power, lam = table.optimum()
     assert power == pytest.approx(0.466, abs=5e-4)
     assert lam == pytest.approx(7.64, abs=0.02)
-
-
-@pytest.mark.parametrize("make", [PowerCoefficientTable.nrel5mw, uneven])
-def test_reproduces_the_table(make):
-    table = make()
-    nodes = table(grid(table.tip_speed_ratio.numpy(), table.pitch.numpy())).squeeze(-1)
-    # Each node is the origin of its own cell: exact but for the spline solver's rounding (values up to 12).
-    torch.testing.assert_close(nodes, table.values, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("make", [PowerCoefficientTable.nrel5mw, uneven])
@@ -135,23 +124,6 @@ def test_overspeed_brakes(table):
     assert torch.isfinite(power).all()
 
 
-def test_batches_compiles_and_maps(table):
-    x = features(*POINTS.values())
-    expected = torch.stack([table(point) for point in x])
-    # The same additions and products in the same order; a fused multiply-add may differ in the last bit.
-    for result in (table(x), table(x.reshape(2, -1, 2)).reshape(-1, 1), torch.func.vmap(table)(x)):
-        torch.testing.assert_close(result, expected, rtol=1e-14, atol=1e-14)
-    # Under test the annotations are checked at run time, which the tracer cannot follow: trace the bare function.
-    bare = inspect.unwrap(PowerCoefficientTable.forward)
-    traced = torch.compile(lambda point: bare(table, point), fullgraph=True, backend="aot_eager")(x)
-    torch.testing.assert_close(traced, expected, rtol=1e-14, atol=1e-14)
-    tangents = torch.ones_like(x)
-    forward = torch.func.jvp(table, (x,), (tangents,))[1]
-    x.requires_grad_()
-    reverse = torch.autograd.grad(table(x).sum(), x)[0].sum(dim=-1, keepdim=True)
-    torch.testing.assert_close(forward, reverse, rtol=1e-12, atol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def rotor() -> Rotor:
     return Rotor.nrel5mw()
@@ -167,23 +139,6 @@ def test_reproduces_the_published_map(rotor):
     assert error.size == 179
     assert np.sqrt(np.mean(error**2)) < 0.006
     assert np.abs(error).max() < 0.02
-
-
-@pytest.mark.parametrize("lam, pitch", [(4.0, 0.0), (7.55, 0.0), (7.55, 10.0), (12.0, -3.0), (14.0, 0.0)])
-def test_blade_forces_balance_the_momentum(rotor, lam, pitch):
-    plain = replace(rotor, precone=0.0, tilt=0.0, shear=0.0, n_sectors=1)
-    flow = solve_inflow(plain, [lam], [pitch])
-    r, a, loss = plain.blade.r, flow.a[0, 0, 0], flow.loss[0, 0, 0]
-    assert (flow.phi > 0).all()
-    # Unit wind, forces per ½ρ: an annulus of unit width has the area 2πr. Momentum up to a = 0.4, Buhl's parabola
-    # above; both are stated in a, not in the κ of the solver.
-    momentum = 4 * loss * a * (1 - a)
-    buhl = 8 / 9 + (4 * loss - 40 / 9) * a + (50 / 9 - 4 * loss) * a**2
-    thrust = 2 * np.pi * r * np.where(a <= 0.4, momentum, buhl)
-    spin = 2 * np.pi * r * 4 * loss * flow.a_tangential[0, 0, 0] * (1 - a) * lam * r / plain.tip_radius
-    # Bisection leaves 6e-15 rad, amplified by 1/sin²φ and by the forces' size of some 10 m.
-    np.testing.assert_allclose(3 * flow.normal[0, 0, 0], thrust, rtol=1e-9, atol=1e-8)
-    np.testing.assert_allclose(3 * flow.tangential[0, 0, 0], spin, rtol=1e-9, atol=1e-8)
 
 
 def glauert_optimum(x):

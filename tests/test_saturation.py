@@ -92,16 +92,6 @@ def test_second_derivative_is_continuous_across_cells():
     assert ((found[1] - found[0]).abs() < 1e-7 * sizes).all()
 
 
-def test_batches_and_function_transforms():
-    fit = Saturation()
-    p = torch.linspace(LOW, HIGH, 24, dtype=torch.float64).view(2, 3, 4)
-    flat = torch.stack(fit(p.flatten()), -1).view(2, 3, 4, 5)
-    assert torch.equal(torch.stack(fit(p), -1), flat)
-    assert torch.equal(torch.vmap(lambda q: torch.stack(fit(q), -1))(p), flat)
-    _, tangent = torch.func.jvp(lambda q: fit(q).T, (p,), (torch.ones_like(p),))
-    torch.testing.assert_close(tangent, fit.with_slopes(p)[1].T)
-
-
 # Outside the range
 
 
@@ -179,14 +169,6 @@ def test_a_damaged_cache_is_fitted_again(own_cache, how, monkeypatch):
     saturation.coefficients.cache_clear()
     monkeypatch.setattr(saturation, "fit", forbidden)
     assert torch.equal(Saturation().table, whole)  # the file was mended
-
-
-def test_another_coolprop_is_fitted_again(own_cache, monkeypatch):
-    Saturation()
-    saturation.coefficients.cache_clear()
-    monkeypatch.setattr(saturation, "version", lambda name: "99.0")
-    Saturation()
-    assert len(list(own_cache.iterdir())) == 2
 
 
 def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):

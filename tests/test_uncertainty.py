@@ -15,7 +15,7 @@ from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
 from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of, state_sensors
-from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values, newey_west
+from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 ROBUST = EstimationConfig(errors="robust")
@@ -130,13 +130,6 @@ def test_standard_errors_are_those_of_regression(smooth):
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
     # that in the error; the window takes another few per cent of the correlation and of the trend.
     assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
-
-
-def test_scores_of_white_noise_sum_to_their_variance():
-    scores = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = newey_west(scores)
-    # Fourteen lags of 20 000 samples: 2·14·2/3/20 000 is a scatter of 3 %.
-    torch.testing.assert_close(found / 20_000, torch.eye(2).double(), rtol=0, atol=0.12)
 
 
 def test_named_errors_follow_from_those_of_the_logarithms():

@@ -166,11 +166,6 @@ def test_several_systems_combine_in_the_order_of_their_parts():
     assert config.believed().states == config.plant().readings
 
 
-def test_the_hop_has_its_target():
-    config = config_class_of(RECIPES / "flapping_wing.py")(task="hop", unknown=("plane_6.3",))
-    assert config.believed().target.tolist() == [1.0, 1.0] and config.plant().base.target.tolist() == [1.0, 1.0]
-
-
 def test_the_policies_of_an_unknown_system_are_made_for_what_the_twin_knows(tmp_path):
     config, parts = leave_run(tmp_path, "wind_turbine", policy="scheduled", unknown=("pitch",))
     run = load_run(tmp_path)
