@@ -13,6 +13,10 @@ from rt_torchrl.options import array_of
 
 Axis = Sequence[float] | np.ndarray
 Rows = Sequence[Sequence[float]] | np.ndarray
+Knots = Float[np.ndarray, " _"]
+"""Places along an axis, in increasing order."""
+Cells = Float[np.ndarray, "_ 4 ..."]
+"""Coefficients of cubics between knots, lowest power first."""
 DATA = Path(__file__).parent / "data"
 STALL_KNOT = 0.5
 """Knot between the two pieces of the stall element, as a fraction of the table's least λ."""
@@ -149,9 +153,7 @@ def csv_rows(path: str | Path) -> list[list[str]]:
     return rows
 
 
-def _spline_cells(
-    knots: Float[np.ndarray, " n"], values: Float[np.ndarray, "n ..."]
-) -> Float[np.ndarray, "cells 4 ..."]:
+def _spline_cells(knots: Knots, values: np.ndarray) -> Cells:
     """Coefficients, lowest power first, of the n − 1 cells of a not-a-knot spline and of a linear cell on either side.
 
     Each cell's origin is its left knot; the cell to the left of all knots takes the first knot.
@@ -164,9 +166,7 @@ def _spline_cells(
     return np.concatenate([ends[:1], inner, ends[1:]])
 
 
-def _add_stall(
-    rows: Float[np.ndarray, "cells 4 n_beta"], lam: Float[np.ndarray, " n_lam"]
-) -> tuple[Float[np.ndarray, "more 4 n_beta"], Float[np.ndarray, " knots"]]:
+def _add_stall(rows: Cells, lam: Knots) -> tuple[Cells, Knots]:
     """Replace the linear cell below the first row by zero (λ < 0), a parabola and a cubic; return cells and knots."""
     value, slope, zero = rows[0, 0], rows[0, 1], 0 * rows[0, 0]
     lam_0 = STALL_KNOT * lam[0]
@@ -187,7 +187,7 @@ def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
 
 def _checked(
     tip_speed_ratio: Axis, pitch: Axis, values: Rows
-) -> tuple[Float[np.ndarray, " n_lam"], Float[np.ndarray, " n_beta"], Float[np.ndarray, "n_lam n_beta"]]:
+) -> tuple[Knots, Knots, Float[np.ndarray, "rows columns"]]:
     axes = {"tip_speed_ratio": array_of("tip_speed_ratio", tip_speed_ratio), "pitch": array_of("pitch", pitch)}
     for name, axis in axes.items():
         if axis.ndim != 1 or len(axis) < 4 or not np.isfinite(axis).all() or (np.diff(axis) <= 0).any():

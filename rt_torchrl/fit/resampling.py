@@ -19,12 +19,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.log import SensorLog, logged_states
+from rt_torchrl.fit.log import Rows, SensorLog, logged_states
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, known_sensors, sensors_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory
 
+Samples = Float[np.ndarray, " samples"]
+"""Values at control instants, or these instants."""
 GAP_INTERVALS = 3.0
 """Number of sampling intervals after which a pause counts as a gap, unless a limit is given."""
 INTERVALS_PER_ROW = 50
@@ -123,9 +125,7 @@ def hold_out(
     return training, held_out
 
 
-def hold_means(
-    times: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, " intervals"]:
+def hold_means(times: Rows, values: Rows, grid: Samples) -> Float[np.ndarray, " intervals"]:
     """Exact means, over every interval of a grid, of a signal that holds its value from each time to the next."""
     integral = np.append(0.0, np.cumsum(values[:-1] * np.diff(times)))
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
@@ -170,12 +170,7 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
     return Trajectory(states, actions, exogenous, float(times[0]), None if seen.all() else seen)
 
 
-def _interpolated(
-    state: Signal,
-    times: Float[np.ndarray, " rows"],
-    values: Float[np.ndarray, " rows"],
-    grid: Float[np.ndarray, " samples"],
-) -> Float[np.ndarray, " samples"]:
+def _interpolated(state: Signal, times: Rows, values: Rows, grid: Samples) -> Samples:
     if state.periodic:
         values = np.unwrap(values, period=state.period)
     return state.wrapped(np.interp(grid, times, values))
@@ -279,7 +274,7 @@ def logged_readings(
     return SensorRecord(readings, segment.actions, segment.exogenous, states[0], float(segment.start), course=states)
 
 
-def _around(log: SensorLog, grid: Float[np.ndarray, " samples"]) -> slice:
+def _around(log: SensorLog, grid: Samples) -> slice:
     """The rows between the cuts of the log around a segment."""
     cuts = np.array((0, *log.cuts, len(log.times)))
     middle = np.searchsorted(log.times, 0.5 * (grid[0] + grid[-1]), side="right") - 1
@@ -287,13 +282,7 @@ def _around(log: SensorLog, grid: Float[np.ndarray, " samples"]) -> slice:
     return slice(int(cuts[part - 1]), int(cuts[part]))
 
 
-def _samples(
-    signal: Signal,
-    times: Float[np.ndarray, " rows"],
-    values: Float[np.ndarray, " rows"],
-    grid: Float[np.ndarray, " samples"],
-    gap: float,
-) -> Float[np.ndarray, " samples"]:
+def _samples(signal: Signal, times: Rows, values: Rows, grid: Samples, gap: float) -> Samples:
     seen = np.isfinite(values)
     times, values = times[seen], values[seen]
     if len(times) < 2:
