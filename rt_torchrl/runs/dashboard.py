@@ -2,9 +2,6 @@
 
 import os
 import re
-import sys
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -19,7 +16,6 @@ from tqdm import tqdm
 from rt_torchrl.runs.results import on_the_twin, progress
 from rt_torchrl.runs.run_config import LoggerName
 from rt_torchrl.steps.config import Role
-from rt_torchrl.trajectories.engines.parallel import watched_compilation
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
@@ -238,15 +234,10 @@ WORDS = {
     "switch": "comparing policies",
 }
 """Words in which the bar shows each step of the algorithm."""
-ON_TERMINAL, IN_FILE = 0.5, 30.0
-"""Time between two refreshes [s]; it is longer in a file, which keeps every one of them."""
 
 
 class Progress:
-    """A bar over the real episodes that also moves during a step.
-
-    It shows the costs of the last episode, the present step with its time, and whether the compiler is at work. The
-    first graphs take a minute to compile, in which nothing else would move.
+    """A bar over the real episodes, with the costs of the last one and the present step.
 
     Args:
         total: number of real episodes of the training.
@@ -255,29 +246,20 @@ class Progress:
 
     def __init__(self, total: int, done: int = 0):
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True)
-        self._interval = ON_TERMINAL if sys.stderr.isatty() else IN_FILE
-        self._costs, self._doing, self._since = "", "starting", time.perf_counter()
-        self._compiling, self._alarm, self._ended = False, False, threading.Event()
+        self._costs, self._doing, self._alarm = "", "starting", False
         self._believed: str | None = None
-        self._thread = threading.Thread(target=self._keep_moving, daemon=True)
 
     def __enter__(self) -> "Progress":
-        self._watch = watched_compilation(self._compilation)
-        self._watch.__enter__()
-        self._thread.start()
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._ended.set()
-        self._thread.join()
-        self._watch.__exit__(None, None, None)
         self._doing = ""
         self._show()
         self._bar.close()
 
     def doing(self, what: str) -> None:
         """Show what begins now: the name of a step of the algorithm, or any other words."""
-        self._doing, self._since = WORDS.get(what, what), time.perf_counter()
+        self._doing = WORDS.get(what, what)
         self._show()
 
     def episode(self, record: dict[str, Any]) -> None:
@@ -303,14 +285,5 @@ class Progress:
         """Write a line above the bar."""
         self._bar.write(line)
 
-    def _compilation(self, under_way: bool) -> None:
-        self._compiling = under_way
-
-    def _keep_moving(self) -> None:
-        while not self._ended.wait(self._interval):
-            self._show()
-
     def _show(self) -> None:
-        seconds = time.perf_counter() - self._since
-        doing = f"{self._doing} {seconds:.0f} s{', compiling' if self._compiling else ''}" if self._doing else ""
-        self._bar.set_postfix_str("; ".join(part for part in (self._costs, doing) if part))
+        self._bar.set_postfix_str("; ".join(part for part in (self._costs, self._doing) if part))

@@ -311,20 +311,6 @@ def missing_for_compilation() -> str | None:
     return None
 
 
-@contextmanager
-def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
-    """A context that calls ``tell(True)`` when the compiler begins and ``tell(False)`` when it ends."""
-    from torch._dynamo.callback import callback_handler
-
-    begun = callback_handler.register_start_callback(lambda arguments: tell(True))
-    ended = callback_handler.register_end_callback(lambda arguments: tell(False))
-    try:
-        yield
-    finally:
-        callback_handler.remove_start_callback(begun)
-        callback_handler.remove_end_callback(ended)
-
-
 @cache
 def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     # Cached, so that every user of a function shares its graphs.
