@@ -1,241 +1,267 @@
-"""Measure time and memory of forward and gradient by each engine, JAX and CasADi; all take turns in one process."""
+"""Time an episode's cost and its gradient by each engine; all take turns in one process."""
 
-import dataclasses
+import itertools
 import json
-import platform
+import statistics
 import sys
-import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from rt_torchrl import begin_loading
 
 if __name__ == "__main__":
     begin_loading()
 
-from benchmarking import cores, fresh_process
-from benchmarking.case import Case, ClosureKind, PlantName, PolicyKind, system_of
-from benchmarking.contenders import Casadi, Contenders, Jax
-from benchmarking.sizes import Grid
-from benchmarking.summary import Summary
-from benchmarking.tables import start_table, time_table, training_table, update_table
-from benchmarking.timing import Cell, Stopwatch
-from benchmarking.trainings import seconds_of_steps
+import torch
+from torch import Tensor, nn
 
-from rt_torchrl import Engine, main_of
-from rt_torchrl.atomic_file import new_folder
-from rt_torchrl.trajectories.rollout import ENGINES
+from rt_torchrl import Engine, Plant, Rollout, SaturatedMLP, Scenario, configuration, main_of, shipped_plants
+from rt_torchrl.options import AtLeastOne, File, Positive
+from rt_torchrl.trajectories.rollout import refusal
 
-SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0, "updates": 1.0}
-"""Shares of the minutes after which the parts of the benchmark begin nothing more."""
+PlantName = Literal["flapping_wing", "wind_turbine", "cryogenic_tank"]
+Policy = Literal["affine", "mlp"]
+QUANTITIES = ("forward", "gradient")
+TURN = 0.1
+"""Time [s] that the calls of a turn take together. A single call of a millisecond would measure what the engine before
+it left in the caches."""
+STEPS_OF: dict[PlantName, float] = {"cryogenic_tank": 4.32}
+"""Control intervals that differ from the plants' own [s]: with 30 s the tank would run empty within 1e5 intervals."""
+HIDDEN = (32, 32)
+COLOURS = {"native": "#D55E00", "parallel": "#0072B2", "odeint_adjoint": "#009E73", "autograd": "#222222"}
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class Config:
-    """Time J_a and its gradient with respect to the policy by the gradient engines, by JAX and by CasADi.
+    """Time J_a and its gradient by the policy's weights by the gradient engines.
 
     Args:
-        plants: plants; the first one matters most.
-        closures: closures, law for the plant's own and mlp for one with a perceptron of 32 x 32.
-        policies: policies, affine for the plant's own and mlp for a perceptron of 32 x 32.
+        plants: plants, with their own closures.
+        policy: affine for the plant's own policy, mlp for a perceptron of 32 x 32; its weights are random.
         horizons: numbers of control intervals.
-        realisations: numbers of trajectories N_z.
-        at_horizon: number of control intervals with which the realisations vary.
-        at_realisations: number of trajectories with which the horizons vary.
-        all_pairs: whether to time all pairs of horizons and realisations instead of these two lines.
-        threads: numbers of CPU threads, which take turns; on Linux JAX has as many cores.
-        engines: gradient engines; those that cannot roll a plant out are left out. Ratios are of native, or else of the
-            first one.
-        jax: jax_scan for one scan that JAX differentiates, jax_sweep for a reverse sweep by hand; both need the extra
-            bench.
-        casadi: casadi_scalar for C code of one realisation after another, casadi_lanes for the same code with vectors
-            over realisations; both are written for the drone with its law, and need the extra bench and g++.
-        compiled: compile the engines.
-        eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
-        repeats: greatest number of turns behind a median, each of calls for a tenth of a second, at least one.
-        limit: predicted time of one evaluation [s] above which a size is left out.
-        minutes: time [min] after which nothing new begins; 0 sets no end.
-        starts: whether to measure compilation and memory in fresh processes.
-        episodes: number of episodes of a short training of each plant with the engine that the ratios are of; its steps
-            are timed. 0 leaves the trainings out.
-        updates: number of iterations of critic and policy in an update of step 2, which is timed with the learner of
-            each plant's recipe. 0 leaves the updates out.
-        quick: whether to make a small benchmark with all its parts but the trainings and updates.
-        log_dir: folder of tables and figures; by default runs/benchmark/TIME.
+        realisations: numbers of trajectories N_z; each is timed with each horizon.
+        engines: gradient engines; ratios are over the first one. An engine that cannot roll a plant out is left out.
+        compiled: compile with torch.compile what an engine leaves to torch.
+        threads: number of CPU threads. On one thread the times are CPU times, which other processes on the machine
+            change least; on more threads they are wall times.
+        repeats: number of turns behind a median, each of calls for a tenth of a second, at least one.
+        limit: time of one call [s], predicted by smaller sizes, above which an engine is left out.
+        quick: whether to time two small sizes once.
+        output: folder for benchmark.json and a figure of each plant; by default nothing is written.
     """
 
     plants: tuple[PlantName, ...] = get_args(PlantName)
-    closures: tuple[ClosureKind, ...] = ("law",)
-    policies: tuple[PolicyKind, ...] = ("affine",)
-    horizons: tuple[int, ...] = (100, 1_000, 10_000, 100_000)
-    realisations: tuple[int, ...] = (1, 5, 25, 125)
-    at_horizon: int = 10_000
-    at_realisations: int = 5
-    all_pairs: bool = False
-    threads: tuple[int, ...] = (1, 2)
-    engines: tuple[Engine, ...] = tuple(ENGINES)
-    jax: tuple[Jax, ...] = get_args(Jax)
-    casadi: tuple[Casadi, ...] = get_args(Casadi)
-    compiled: bool = True
-    eager: tuple[Engine, ...] = ("odeint_adjoint", "autograd")
-    repeats: int = 5
-    limit: float = 10.0
-    minutes: float = 10.0
-    starts: bool = True
-    episodes: int = 2
-    updates: int = 300
+    policy: Policy = "affine"
+    horizons: tuple[AtLeastOne, ...] = (100, 1_000, 10_000)
+    realisations: tuple[AtLeastOne, ...] = (5, 25)
+    engines: tuple[Engine, ...] = get_args(Engine)
+    compiled: bool = False
+    threads: AtLeastOne = 1
+    repeats: AtLeastOne = 5
+    limit: Positive = 2.0
     quick: bool = False
-    log_dir: Path | None = None
+    output: File | None = None
 
-    def __post_init__(self):
-        for name in ("plants", "closures", "policies", "horizons", "realisations", "threads", "engines"):
+    def __post_init__(self) -> None:
+        for name in ("plants", "horizons", "realisations", "engines"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name}={values} must be one value or several different ones.")
-        for name in ("horizons", "realisations", "threads"):
-            if min(getattr(self, name)) < 1:
-                raise ValueError(f"{name}={getattr(self, name)} must all be at least 1.")
-        for name, least in (("at_horizon", 1), ("at_realisations", 1), ("repeats", 1), ("episodes", 0), ("updates", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
-        if max(self.threads) > cores.available():
-            raise ValueError(f"threads={self.threads} must be at most {cores.available()}, the cores of this process.")
-        if not self.limit > 0 or not self.minutes >= 0:
-            raise ValueError(f"limit={self.limit} s must be positive, and minutes={self.minutes} zero or above.")
 
     def effective(self) -> "Config":
         """The options that are carried out, in which ``quick`` has replaced other options."""
-        if not self.quick:
-            return self
-        sizes = {"horizons": (20, 60), "realisations": (1, 2), "at_horizon": 20, "at_realisations": 2}
-        return dataclasses.replace(self, **sizes, repeats=1, episodes=0, updates=0, quick=False)
-
-    def grid(self) -> Grid:
-        cases = [Case(p, c, a) for c in self.closures for a in self.policies for p in self.plants]
-        lines = (self.horizons, self.realisations, self.at_horizon, self.at_realisations)
-        return Grid(cases, self.threads, *lines, all_pairs=self.all_pairs)
-
-    def contenders(self) -> Contenders:
-        return Contenders(self.engines, self.jax, self.casadi, self.compiled, self.eager)
-
-    def subject(self) -> Engine:
-        """The engine that is compared with the others."""
-        return next((engine for engine in self.engines if engine == "native"), self.engines[0])
+        return replace(self, horizons=(20, 60), realisations=(2,), repeats=1, quick=False) if self.quick else self
 
 
-class Benchmark:
-    """The parts of a benchmark, which share its time; each leaves out what it has no time for, and says so."""
+class System(NamedTuple):
+    """A plant with a closure and a policy of random weights; those of the closure are fixed, as when one plans."""
 
-    def __init__(self, config: Config, folder: Path):
-        self.config, self.folder, self.began = config, folder, time.monotonic()
-        self.stopwatch = Stopwatch(config.contenders(), config.repeats, config.limit, _tell)
-        self.starts: dict[str, dict[str, dict[str, float]]] = {}
-        self.trainings: dict[str, list[float]] = {}
-        self.updates: dict[str, dict[str, float]] = {}
-        self.out_of_time: list[str] = []
+    plant: Plant
+    closure: nn.Module
+    policy: nn.Module
 
-    def run(self) -> None:
-        self._times()
-        if self.config.starts:
-            self._starts()
-        if self.config.episodes:
-            self._trainings()
-        if self.config.updates:
-            self._updates()
 
-    def _late(self, part: str, what: str) -> bool:
-        late = 0 < 60.0 * self.config.minutes * SHARES[part] < time.monotonic() - self.began
-        if late:
-            self.out_of_time.append(what)
-        return late
+class Calls(NamedTuple):
+    """What is timed, of one scenario: the mean cost, and its gradient by the policy's weights, flat in their order."""
 
-    def _times(self) -> None:
-        shortest, timed = min(self.config.horizons), set()
-        for sizes in self.config.grid():
-            if self._late("times", f"{sizes[0].case.name}, {sizes[0].steps} x {sizes[0].realisations}"):
-                continue
-            found = self.stopwatch.time(sizes)
-            timed.add(sizes[0])
-            slow = list(dict.fromkeys(cell.contender for cell in found if "predicted" in cell.left_out))
-            short = [dataclasses.replace(size, steps=shortest) for size in sizes]
-            if slow and short[0] not in timed:  # what is too slow is timed over a short horizon, and scaled per step
-                timed.add(short[0])
-                self.stopwatch.time(short, slow)
+    forward: Callable[[], float]
+    gradient: Callable[[], Tensor]
 
-    def _starts(self) -> None:
-        config, cells = self.config, self.stopwatch.cells
-        for case in config.grid().cases:
-            system = system_of(case)
-            for name in config.contenders().names:
-                if config.contenders().refusal(name, system) or self._late("starts", f"start, {case.name}: {name}"):
-                    continue
-                _tell(f"start of {name}, {case.name}")
-                found = fresh_process.started(config.contenders(), name, case, self._longest(cells, name, case))
-                self.starts.setdefault(case.name, {})[name] = found
 
-    def _longest(self, cells: list[Cell], name: str, case: Case) -> tuple[int, int] | None:
-        """The longest horizon at which a contender's gradient has been timed with ``at_realisations``."""
-        steps = [
-            cell.size.steps
-            for cell in cells
-            if (cell.contender, cell.size.case, cell.quantity) == (name, case, "gradient")
-            and cell.size.realisations == self.config.at_realisations
-            and not cell.left_out
+Contender = Callable[[Scenario], Calls]
+
+
+class Row(NamedTuple):
+    """The times of one contender at one size.
+
+    Args:
+        plant: name of the plant.
+        steps: number of control intervals.
+        realisations: number of trajectories.
+        contender: name of the engine.
+        forward: median time of the cost [s].
+        gradient: median time of its gradient [s].
+        ratio: time of the gradient over that of the first contender.
+        first: wall time of the first gradient of this size [s], which may compile.
+        gap: relative difference of the gradient from that of the first contender.
+    """
+
+    plant: str
+    steps: int
+    realisations: int
+    contender: str
+    forward: float
+    gradient: float
+    ratio: float
+    first: float
+    gap: float
+
+
+def plant_of(name: PlantName, steps: int | None = None) -> Plant:
+    """A plant, with episodes of this many control intervals or of its own number."""
+    kind = shipped_plants()[name]
+    options: dict[str, float] = {"dt": STEPS_OF[name]} if name in STEPS_OF else {}
+    return kind(**options) if steps is None else kind(**options, horizon=steps * kind(**options).dt)
+
+
+def system_of(name: PlantName, policy: Policy) -> System:
+    """The plant of a name with its closure and a policy."""
+    plant, generator = plant_of(name), torch.Generator().manual_seed(0)
+    closure = plant.make_closure(generator).requires_grad_(False)
+    if policy == "affine":
+        return System(plant, closure, plant.make_policy(generator))
+    made = SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
+    return System(plant, closure, made)
+
+
+def engine_of(engine: Engine, system: System, *, compiled: bool) -> Contender:
+    """An engine of the library, called as a planner calls it."""
+    rollout, weights = Rollout(*system, engine=engine, compiled=compiled), list(system.policy.parameters())
+
+    def calls(scenario: Scenario) -> Calls:
+        @torch.no_grad()
+        def forward() -> float:
+            return rollout.costs(*scenario).mean().item()
+
+        def gradient() -> Tensor:
+            parts = torch.autograd.grad(rollout.costs(*scenario).mean(), weights)
+            return torch.cat([part.flatten() for part in parts])
+
+        return Calls(forward, gradient)
+
+    return calls
+
+
+def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[System], Contender]]) -> list[Row]:
+    """The times of all contenders on one plant, the smaller sizes first."""
+    system, rows = system_of(name, config.policy), list[Row]()
+    contenders = {
+        engine: engine_of(engine, system, compiled=config.compiled)
+        for engine in config.engines
+        if refusal(engine, system.plant) is None
+    }
+    contenders |= {peer: make(system) for peer, make in peers.items()}
+    for steps, batch in sorted(
+        itertools.product(config.horizons, config.realisations), key=lambda pair: pair[0] * pair[1]
+    ):
+        plant, generator = plant_of(name, steps), torch.Generator().manual_seed(1)
+        scenario = Scenario(plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator))
+        calls = {
+            contender: made(scenario)
+            for contender, made in contenders.items()
+            if predicted(rows, contender, steps, batch) <= config.limit
+        }
+        _tell(f"{name}, {steps} intervals, {batch} realisations: {', '.join(calls)}")
+        gradients, first = dict[str, Tensor](), dict[str, float]()
+        for contender, call in calls.items():
+            start = time.perf_counter()
+            gradients[contender] = call.gradient()
+            first[contender] = time.perf_counter() - start
+        forward, gradient = (
+            medians({who: getattr(call, quantity) for who, call in calls.items()}, config) for quantity in QUANTITIES
+        )
+        best = next(iter(calls), "")
+        rows += [
+            Row(
+                name,
+                steps,
+                batch,
+                who,
+                forward[who],
+                gradient[who],
+                gradient[who] / gradient[best],
+                first[who],
+                ((gradients[who] - gradients[best]).norm() / gradients[best].norm()).item(),
+            )
+            for who in calls
         ]
-        return (max(steps), self.config.at_realisations) if steps else None
+    return rows
 
-    def _trainings(self) -> None:
-        config, engine = self.config, self.config.subject()
-        for plant in config.plants:
-            name = f"{plant}, {engine}"
-            if self._late("trainings", f"training, {name}"):
-                continue
-            _tell(f"training, {name}")
-            with tempfile.TemporaryDirectory() as run:
-                steps = seconds_of_steps(plant, engine, Path(run), config.episodes, compiled=config.compiled)
-            self.trainings[name] = steps
 
-    def _updates(self) -> None:
-        from benchmarking.updates import milliseconds_of_update  # here, because --help need not wait for TorchRL
+def predicted(rows: Sequence[Row], contender: str, steps: int, realisations: int) -> float:
+    """Time of a gradient [s] that smaller sizes predict, in proportion to the steps and to more realisations."""
+    return min(
+        (
+            row.gradient * steps / row.steps * max(1.0, realisations / row.realisations)
+            for row in rows
+            if row.contender == contender
+        ),
+        default=0.0,
+    )
 
-        config = self.config
-        for plant in config.plants:
-            if not self._late("updates", f"update, {plant}"):
-                _tell(f"update, {plant}")
-                self.updates[plant] = milliseconds_of_update(plant, config.updates, config.repeats)
 
-    def report(self) -> str:
-        """The tables and the summary."""
-        parts = [time_table(self.stopwatch.cells)]
-        parts += [start_table(self.starts)] if self.starts else []
-        parts += [training_table(self.trainings)] if self.trainings else []
-        parts += [update_table(self.updates)] if self.updates else []
-        if self.out_of_time:
-            parts.append(f"no time within minutes={self.config.minutes:g} for:\n  " + "\n  ".join(self.out_of_time))
-        return "\n\n".join([*parts, "summary\n" + "\n".join(f"  {line}" for line in self.summary())])
+def medians(functions: Mapping[str, Callable[[], Any]], config: Config) -> dict[str, float]:
+    """Median time of one call of each function [s]; in each turn every function has its calls, one after another."""
+    clock = time.process_time if config.threads == 1 else time.perf_counter
+    seconds, counts = {name: list[float]() for name in functions}, dict[str, int]()
+    for _ in range(config.repeats):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            function()
+            count = counts.setdefault(name, max(1, round(TURN / (time.perf_counter() - start))))
+            start = clock()
+            for _ in range(count):
+                function()
+            seconds[name].append((clock() - start) / count)
+    return {name: statistics.median(values) for name, values in seconds.items()}
 
-    def summary(self) -> list[str]:
-        """The ratios, and the compilation of the engine that they are about."""
-        lines = Summary(self.stopwatch.cells, self.config.subject()).lines()
-        for case, found in self.starts.items():
-            own = found.get(self.config.subject())
-            lines += [f"{case}: {self.config.subject()} compiles in {own['cold']:.2f} s cold"] if own else []
-        return lines
 
-    def save(self) -> None:
-        """Write ``benchmark.json``, ``benchmark.txt`` and the figures."""
-        machine = {"machine": platform.platform(), "processor": platform.machine(), "cores": cores.available()}
-        result: dict[str, Any] = {**machine, "python": platform.python_version(), "command": sys.argv}
-        result |= {"cells": [cell.record() for cell in self.stopwatch.cells], "starts": self.starts}
-        result |= {"trainings": self.trainings, "updates": self.updates}
-        result |= {"out_of_time": self.out_of_time, "summary": self.summary()}
-        (self.folder / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        (self.folder / "benchmark.txt").write_text(self.report() + "\n", encoding="utf-8")
-        from benchmarking.figures import save_figures  # here, because --help need not wait for Matplotlib
+def table(rows: Sequence[Row], config: Config) -> str:
+    """The times as text; a size and engine that are not in it would have taken longer than the limit."""
+    clock = "CPU" if config.threads == 1 else "wall"
+    head = f"{'plant':<15}{'intervals':>9}{'N_z':>6}  {'engine':<15}{clock + ' ms':>11}{'gradient':>10}"
+    lines = [f"{head}{'ratio':>9}{'first s':>9}{'gap':>9}"]
+    for row in rows:
+        size = f"{row.plant:<15}{row.steps:>9}{row.realisations:>6}  {row.contender:<15}"
+        times = f"{1e3 * row.forward:>11.3f}{1e3 * row.gradient:>10.3f}{row.ratio:>9.1f}{row.first:>9.2f}"
+        lines.append(f"{size}{times}{row.gap:>9.1e}")
+    return "\n".join(lines)
 
-        save_figures(self.stopwatch.cells, self.folder)
+
+def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
+    """Write ``benchmark.json``, and a figure of each plant: times over the horizons at the first N_z."""
+    from rt_torchrl.figures.style import caption, legend_below, panels  # here, because --help need not wait for it
+
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {"command": sys.argv, "threads": config.threads, "rows": [row._asdict() for row in rows]}
+    (folder / "benchmark.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    clock, batch = "CPU" if config.threads == 1 else "wall", config.realisations[0]
+    for plant in config.plants:
+        title = f"{plant}, {config.policy} policy, threads: {config.threads}\n{clock} time [s]"
+        figure, axes = panels(1, 2, title=title, size=(10.5, 4.0), sharey="row")
+        for ax, quantity in zip(axes[0], QUANTITIES, strict=True):
+            drawn = [row for row in rows if (row.plant, row.realisations) == (plant, batch)]
+            for k, who in enumerate(dict.fromkeys(row.contender for row in drawn)):
+                x, y = zip(*((r.steps, getattr(r, quantity)) for r in drawn if r.contender == who), strict=True)
+                look = {"color": COLOURS.get(who, f"C{k}"), "marker": "osv^D*P"[k % 7], "markersize": 5}
+                ax.plot(x, y, label=who.replace("_", " "), **look)
+            ax.set(xscale="log", yscale="log", xlabel="control intervals")
+            caption(ax, quantity, f"{batch} realisations")
+        legend_below(figure, list(axes.flat))
+        figure.savefig(folder / f"{plant}.png")
 
 
 def _tell(doing: str) -> None:
@@ -243,18 +269,24 @@ def _tell(doing: str) -> None:
         print(f"\r\033[K{doing}", end="", file=sys.stderr, flush=True)
 
 
-def main(config: Config) -> None:
+def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | None = None) -> list[Row]:
+    """Time the engines, and others beside them.
+
+    Args:
+        config: the options.
+        peers: others that compute the same, by name; each is a function of the system that gives a contender.
+
+    Returns:
+        The rows of the table that is printed.
+    """
     config = config.effective()
-    folder = config.log_dir or new_folder(Path("runs") / "benchmark")
-    folder.mkdir(parents=True, exist_ok=True)
-    benchmark = Benchmark(config, folder)
-    try:
-        benchmark.run()
-    finally:  # an interrupted benchmark reports what it has
-        _tell("")
-        benchmark.save()
-        print(benchmark.report())
-        print(f"results in {folder}")
+    torch.set_num_threads(config.threads)
+    rows = [row for name in config.plants for row in rows_of(config, name, peers or {})]
+    _tell("")
+    print(table(rows, config))
+    if config.output is not None:
+        save(rows, config, config.output)
+    return rows
 
 
 if __name__ == "__main__":

@@ -16,13 +16,21 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from rt_torchrl import DigitalTwin, Estimate, Estimation, EstimationConfig, SensorRecord, configuration, main_of
+from rt_torchrl import (
+    DigitalTwin,
+    Estimate,
+    Estimation,
+    EstimationConfig,
+    SensorRecord,
+    configuration,
+    main_of,
+    sensors_of,
+)
 from rt_torchrl.atomic_file import write_results
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
 from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.fit.sensors import sensors_of
 from rt_torchrl.options import AtLeastOne, NotNegative
 
 if TYPE_CHECKING:

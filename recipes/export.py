@@ -23,7 +23,7 @@ from rt_torchrl import (
     load_run,
     main_of,
 )
-from rt_torchrl.export.onnx_model import require_packages
+from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
 from rt_torchrl.runs.settings import read_settings
 
@@ -43,8 +43,8 @@ class Config:
             action, with filters and integrals) and twin (one control interval with the learned closure, of the
             hypothesis that explains the records best); controller and twin are written in C alone.
         role: role of the policy, model_based or model_free.
-        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export); by default
-            c, and pt2 of a policy.
+        formats: one or more of c (C99 file and header), onnx (with the extra export) and pt2 (torch.export); by
+            default c, and pt2 of a policy.
         output: folder for the files; by default RUN/exported.
         name: name of the files and of the C function, to which _controller or _twin is added; by default PLANT_ROLE,
             and PLANT for the twin.
@@ -82,7 +82,7 @@ class Config:
 def main(config: Config) -> None:
     formats = config.formats or DEFAULT
     if "onnx" in formats:
-        require_packages()
+        require_packages(ONNX_PACKAGES)
     settings = read_settings(config.run)
     beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
     run = load_run(config.run, config.recipe or beside)

@@ -13,13 +13,12 @@ if __name__ == "__main__":
 
 import torch
 import tyro
+from pydantic import Field
 
 from rt_torchrl import (
-    ClassicalController,
     LimitConfig,
     LoadedRun,
     Plant,
-    PredictiveConfig,
     RunConfig,
     configuration,
     load_run,
@@ -27,9 +26,6 @@ from rt_torchrl import (
 )
 from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.control.command_cost import BoundedDescentConfig
-from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
-from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.limits import (
     Contender,
     classical,
@@ -42,19 +38,12 @@ from rt_torchrl.evaluation.limits import (
     receding,
 )
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.options import Count, NotNegative
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import plant_of
 
-CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
-    "wind_turbine": {"Jonkman": JonkmanController},
-    "flapping_wing": {"PD": TrimmedPD},
-    "cryogenic_tank": {"on-off": OnOffValve, "on-off, resting": RestingOnOff, "PI": PIValve},
-}
-"""Classical controllers that are judged beside the limit."""
 TO_THE_END = BoundedDescentConfig(iterations=8000, tolerance=1e-15, gradient=1e-12)
 """Descents until nothing more is gained; each of the turbine's takes five to eight thousand gradients."""
-SOLVE = ("horizon", "iterations", "tolerance")
-"""Parameters of model predictive control that may differ from the recipe's."""
 
 
 @configuration
@@ -72,8 +61,6 @@ class Config:
         mpc: forecasts of model predictive control: some of held, decaying, scattered and preview; the tank has none
             while it commands the drop.
         mpc_horizon: length of the window of model predictive control [s]; 0 for the recipe's.
-        mpc_iterations: greatest number of iterations in a solve of model predictive control; 0 for the recipe's.
-        mpc_tolerance: relative decrease of the cost below which a solve ends; 0 for the recipe's.
         run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
             are judged beside the controllers, and model predictive control plans on its closure, too.
         folder: folder of the results, which are in PLANT.json.
@@ -81,23 +68,18 @@ class Config:
     """
 
     plant: Literal["wind_turbine", "flapping_wing", "cryogenic_tank"] | None = None
-    episodes: int = 8
-    seed: int = UNSEEN_SEED
+    episodes: Annotated[int, Field(ge=2)] = 8
+    seed: Count = UNSEEN_SEED
     horizon: float | None = None
-    hold: int = 0
+    hold: Count = 0
     starts: Literal["all", "classical"] = "all"
     mpc: tuple[Literal["held", "decaying", "scattered", "preview"], ...] = ("held", "decaying", "scattered", "preview")
-    mpc_horizon: float = 0.0
-    mpc_iterations: int = 0
-    mpc_tolerance: float = 0.0
+    mpc_horizon: NotNegative = 0.0
     run: Path | None = None
     folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/limit")
     descent: BoundedDescentConfig = field(default_factory=lambda: TO_THE_END)
 
     def __post_init__(self):
-        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0), *((f"mpc_{name}", 0) for name in SOLVE)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.run is not None and (self.plant is not None or self.horizon is not None):
             raise ValueError("run has a plant and a horizon of its own; leave out plant and horizon, or run.")
 
@@ -108,9 +90,11 @@ def main(config: Config) -> None:
     run = None if config.run is None else load_run(config.run)
     options = settings(config) if run is None else run.config
     plant = plant_of(options) if run is None else run.plant
-    path, found = config.folder / f"{plant.name}.json", {}
+    known, path, found = options.limit(), config.folder / f"{plant.name}.json", {}
+    if known is None:
+        raise ValueError(f"{type(options).__qualname__} has no limit; override RunConfig.limit() in the recipe.")
     print(f"seeking the clairvoyant optimum of {config.episodes} episodes", flush=True)
-    for name, contender in contenders(config, plant, limit_of(options), run):
+    for name, contender in contenders(config, plant, known, run):
         if not found:
             print(header(contender), flush=True)
         found[name] = contender
@@ -127,18 +111,6 @@ def settings(config: Config) -> RunConfig:
     return dataclasses.replace(recipe.Config(preset="paper").defaults(), **horizon)
 
 
-def limit_of(options: RunConfig) -> LimitConfig:
-    """How the limit of a training's plant is computed.
-
-    Raises:
-        ValueError: if its recipe does not say it.
-    """
-    found = options.limit()
-    if found is None:
-        raise ValueError(f"{type(options).__qualname__} has no limit; override RunConfig.limit() in the recipe.")
-    return found
-
-
 def contenders(
     config: Config, plant: Plant, known: LimitConfig, run: LoadedRun | None
 ) -> Iterator[tuple[str, Contender]]:
@@ -149,25 +121,20 @@ def contenders(
     starts = flown_starts(episodes, known) | {role: episodes.fly(policy).actions for role, policy in policies.items()}
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
     yield "clairvoyant", limit(episodes, chosen, hold=config.hold or known.hold, config=config.descent)
-    for name, controller in CONTROLLERS.get(plant.name, {}).items():
+    for name, controller in known.starts.items():
         yield name, classical(episodes, controller)
     for role, policy in policies.items():
         yield role, learned(episodes, policy)
     if known.window is None:
         return
-    window = fitting(chosen_window(config, known.window), plant)
+    asked = {"horizon": config.mpc_horizon} if config.mpc_horizon else {}
+    window = fitting(dataclasses.replace(known.window, **asked), plant)
     foreseen = forecasts(plant, episodes.exogenous, window)
     models = {"exact": (plant, episodes.known_closure())}
     models |= {} if run is None else {"fitted": (run.physics, run.closure)}
     for title, model in models.items():
         for name in config.mpc:
             yield f"MPC, {title}, {name}", receding(episodes, *model, window, foreseen[name])
-
-
-def chosen_window(config: Config, window: PredictiveConfig) -> PredictiveConfig:
-    """The recipe's window with the solves that are asked for."""
-    asked = {name: getattr(config, f"mpc_{name}") for name in SOLVE}
-    return dataclasses.replace(window, **{name: value for name, value in asked.items() if value})
 
 
 def header(best: Contender) -> str:

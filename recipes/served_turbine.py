@@ -42,7 +42,7 @@ class Config(Turbine):
         port: port of the server on this machine.
         connect: whether a server runs already, started with serve; it must have the same dt, pace and observe.
         serve: whether to run the server alone, until Ctrl-C.
-        act: exported policy that acts for one horizon, without a learner: an ONNX model (.onnx, with the extra onnx),
+        act: exported policy that acts for one horizon, without a learner: an ONNX model (.onnx, with the extra export),
             or with trusted a PyTorch program (.pt2) or C (.c, with a C compiler). The results, in_service.json, and the
             events of the safety layer, safety.jsonl, go to log_dir.
         trusted: whether a .pt2 or .c file may run its code, because you know who has written it.

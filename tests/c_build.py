@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from rt_torchrl.export.c_compiler import COMPILERS
+from rt_torchrl.export.c_file import COMPILERS
 
 COMPILER = next(filter(None, map(shutil.which, COMPILERS)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")

@@ -1,6 +1,6 @@
-"""A coverage-guided fuzzer of the readers of files, with atheris (extra ``fuzz``, on Linux).
+"""A coverage-guided fuzzer of the readers of files, with atheris (on Linux).
 
-``uv run --group test --extra fuzz tests/fuzz.py log.csv -max_total_time=60`` fuzzes one reader; the options after its
+``uv run --group test --with atheris tests/fuzz.py log.csv -max_total_time=60`` fuzzes one reader; the options after its
 name are those of libFuzzer. The corpus and the files that break a reader lie in the folder ``fuzzing/NAME``.
 """
 

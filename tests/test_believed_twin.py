@@ -12,7 +12,7 @@ from test_hypotheses import Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.export.c_compiler import c_array
+from rt_torchrl.export.c_file import c_array
 from rt_torchrl.options import configuration
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import BiasedSensor

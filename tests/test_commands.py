@@ -118,9 +118,11 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run docs/quadrotor.py", "uv run docs/heated_room.py"}  # tests/test_documentation.py
-    known |= {"uv run tests/ruler.py"}  # tests/test_results.py
+    known |= {"uv run --extra tank tests/ruler.py"}  # tests/test_results.py
+    known |= {"uv run --group nightly tests/peers.py"}  # tests/test_benchmark.py
+    known |= {"uv run --extra tank docs/gallery.py"}  # tests/test_documentation.py
     known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
-    known |= {f"{PYTEST} -m faults", "uv run --group test --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
+    known |= {f"{PYTEST} -m faults", "uv run --group test --with atheris tests/fuzz.py wind.bts -max_total_time=60"}
     assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
 
@@ -154,7 +156,7 @@ def test_a_command_asks_for_the_groups_that_have_its_program():
     tried = set()
     for command in given:
         words = shlex.split(command)[2:]
-        asked = {"--group": [], "--extra": []}
+        asked = {"--group": [], "--extra": [], "--with": []}
         while words[0] in asked:
             asked[words[0]].append(words[1])
             words = words[2:]
@@ -168,6 +170,7 @@ def test_a_command_asks_for_the_groups_that_have_its_program():
             tried.add(words[0])
         else:
             assert words[0].endswith(".py"), command
+            assert "coolprop" in names or not re.search(r"cryogenic_tank|recipes/benchmark.py(?!.*--plants)", command)
     assert tried == PACKAGES.keys()
 
 

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 from printed_commands import ROOT, TEXTS, blocks
 from tensordict import TensorDict
-from test_export_recipe import RECIPES, leave_run, recipe
+from test_export_recipe import RECIPES, leave_run
 
 import rt_torchrl
 from rt_torchrl import check_plant, load_run
@@ -136,9 +137,9 @@ def test_the_search_of_the_documentation_runs(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path):
-    nbformat = pytest.importorskip("nbformat", reason="the notebook needs the extra notebook")
-    nbclient = pytest.importorskip("nbclient", reason="the notebook needs the extra notebook")
-    pytest.importorskip("ipykernel", reason="the notebook needs the extra notebook")
+    nbformat = pytest.importorskip("nbformat", reason="the notebook comes with the group test")
+    nbclient = pytest.importorskip("nbclient", reason="the notebook comes with the group test")
+    pytest.importorskip("ipykernel", reason="the notebook comes with the group test")
     notebook = nbformat.read(ROOT / "docs" / "first_steps.ipynb", as_version=4)
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
@@ -292,27 +293,9 @@ def test_the_file_of_the_page_trains(name, tmp_path):
     assert re.search("take the controller away: .*recipes/export.py", done.stdout)
 
 
-# The command that draws the gallery: its pictures are those of the page, and one training gives them.
-
-
-PAGE = (RECIPES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
-
-
-def test_its_pictures_are_those_of_the_page():
-    pictures = {f"{plant}_{name}" for plant, names in recipe("gallery").PICTURES.items() for name in names}
-    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", PAGE))
+def test_the_pictures_of_the_gallery_are_those_that_its_script_draws():
+    page = (RECIPES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
+    drawn = runpy.run_path(str(RECIPES.parent / "docs" / "gallery.py"))["PICTURES"]
+    pictures = {f"{plant}_{name}" for plant, names in drawn.items() for name in names}
+    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", page))
     assert all((RECIPES.parent / "docs" / "gallery" / name).is_file() for name in pictures)
-
-
-def test_an_unknown_plant_is_refused():
-    with pytest.raises(ValueError, match="must be some of wind_turbine, flapping_wing, cryogenic_tank"):
-        recipe("gallery").Config(plants=("pendulum",))
-
-
-@pytest.mark.nightly
-def test_a_training_gives_the_pictures_of_a_plant(tmp_path):
-    gallery = recipe("gallery")
-    gallery.main(gallery.Config(plants=("wind_turbine",), quick=True, output=tmp_path / "out", log_dir=tmp_path))
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        f"wind_turbine_{name}" for name in gallery.PICTURES["wind_turbine"]
-    }

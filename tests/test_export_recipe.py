@@ -11,7 +11,7 @@ from linear_quadratic import LinearQuadratic
 from test_run import SMALL
 
 from rt_torchrl import load_run
-from rt_torchrl.export import c_compiler
+from rt_torchrl.export import c_file
 from rt_torchrl.options import read_options
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run import Run
@@ -99,9 +99,9 @@ def test_the_recipe_writes_every_format(tmp_path, capsys):
 
 def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypatch):
     """A run with perceptrons in all places, in C and nothing else."""
-    if not any(map(shutil.which, c_compiler.COMPILERS)):
+    if not any(map(shutil.which, c_file.COMPILERS)):
         pytest.skip("no C compiler here")
-    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 20)
+    monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 20)
     leave_run(tmp_path, "wind_turbine", policy="mlp", closure="mlp", hidden=(5,))
     export = recipe("export")
     export.main(export.Config(run=tmp_path, what=("policy", "controller", "twin"), formats=("c",)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from figure_reading import clipped_texts, collisions, draw, line
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from linear_quadratic import LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
 from rt_torchrl import figures
@@ -23,9 +23,9 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.figures import flights
-from rt_torchrl.figures.policy import RESOLUTION, visited_observations
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES
+from rt_torchrl.figures.training import RESOLUTION, visited_observations
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record, merit_lines, results
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
@@ -188,11 +188,6 @@ def test_policies_of_one_and_of_three_observations(oscillator, count):
         assert any("other observations at their mean" in text for text in texts)
 
 
-def test_contours_of_a_constant_policy(oscillator):
-    constant = LinearGain(torch.zeros(1, 2, dtype=torch.float64))
-    draw(figures.policy_contours(replace(oscillator, policies=dict.fromkeys(oscillator.policies, constant))))
-
-
 def test_learning_curves_timeline_and_events(oscillator):
     live = ["model_free", "model_free", "model_based", "model_based"]
     events = ["keep", "swap", "clone", "keep"]
@@ -281,14 +276,6 @@ def test_scatter_is_twin_over_real(turbine):
     assert "rad/s" in ax.get_title(loc="left") and "rad/s" in ax.get_xlabel()
 
 
-def test_a_perfect_twin_has_no_residual(oscillator):
-    closure = LinearClosure(LinearQuadratic.true_closure)
-    twin, record = DigitalTwin(oscillator.plant, closure), oscillator.record
-    replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None]).states[0].detach()
-    figure = figures.states(replace(oscillator, closure=closure, replay=replay))
-    assert [ax.get_title(loc="right") for ax in figure.axes] == ["RMS 0 m", "RMS 0 m/s"]
-
-
 def flown(plant, count=1, n=40):
     generator = torch.Generator().manual_seed(3)
     policy = plant.make_policy(generator)
@@ -301,34 +288,21 @@ def held(plant, one):
     return plant.setpoints(one.states[:, :-1], one.actions, one.exogenous)
 
 
-def test_the_turbine_follows_what_its_cost_follows():
-    plant = WindTurbine(horizon=20.0)
-    one = flown(plant, 3)
-    found = held(plant, one)
-    speed, wanted = found["generator speed [rad/s]"]
+def test_setpoints_are_what_the_costs_follow():
+    turbine = WindTurbine(horizon=20.0)
+    one = flown(turbine, 3)
+    speed, wanted = held(turbine, one)["generator speed [rad/s]"]
     torch.testing.assert_close(speed, 97.0 * one.states[:, :-1, 0])
-    # Of the reference speeds, the greatest is the rated one: 1173.7 rpm.
-    assert wanted.max() <= 122.91 + 0.01 and (wanted <= 122.91 + 0.01).all()
-    power, reference = found["power [MW]"]
-    assert reference.max() <= 5.3 and power.shape == reference.shape == (3, 40)
-
-
-def test_the_tank_holds_500_kPa_and_the_drone_its_target():
+    assert wanted.max() <= 122.92 and held(turbine, one)["power [MW]"][1].max() <= 5.3  # the rated speed, 1173.7 rpm
+    real = unknown(turbine, ("pitch",))  # an extended plant has the setpoints of its base
+    assert list(held(real, flown(real))) == list(held(turbine, one))
     tank = CryogenicTank(horizon=3000.0)
     pressure, wanted = held(tank, flown(tank))["pressure [kPa]"]
-    assert (wanted == 500.0).all()
     torch.testing.assert_close(pressure, 1e-3 * flown(tank).states[:, :-1, 2])
+    assert (wanted == 500.0).all()
     drone = FlappingWing(horizon=0.05, target=(2.0, 3.0))
-    found = held(drone, flown(drone))
-    assert [found[name][1].unique().item() for name in ("x [m]", "z [m]")] == [2.0, 3.0]
+    assert [held(drone, flown(drone))[name][1].unique().item() for name in ("x [m]", "z [m]")] == [2.0, 3.0]
     assert held(Pendulum(), flown(Pendulum())) == {}
-
-
-def test_an_extended_plant_has_the_setpoints_of_its_base():
-    base = WindTurbine(horizon=20.0)
-    real = unknown(base, ("pitch",))
-    found = held(real, flown(real))
-    assert list(found) == list(held(base, flown(base)))
 
 
 def test_every_controller_is_drawn_and_the_setpoint_once():
@@ -379,10 +353,15 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
     assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
 
 
-def test_names_of_four_controllers_do_not_meet():
-    figure = figures.unseen(judged("model_based", "model_free", "on-off", "Jonkman"), {})
+@pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (0.0, "linear"), (-0.5, "linear")])
+def test_only_positive_costs_have_a_logarithmic_axis(oscillator, least, scale):
+    found = judged("model_based", "model_free", "on-off", "Jonkman")
+    found["Jonkman"].control_costs[0] = least
+    figure = figures.unseen(found, {})
     draw(figure)
-    assert not collisions(figure)
+    assert not collisions(figure) and figure.axes[0].get_yscale() == scale
+    episodes = [{"real_cost": cost, "J_p": 1.0} for cost in (1.0, least)]
+    assert figures.learning_curves(replace(oscillator, episodes=episodes)).axes[0].get_yscale() == scale
 
 
 def test_kinds_of_episodes_are_counted_and_averaged_apart():

@@ -111,6 +111,8 @@ def test_an_fmu_has_every_function_of_the_standard(tmp_path):
     names = set(FUNCTIONS.findall(common + exchange.split("Functions for FMI2 for Co-Simulation")[1]))
     assert len(names) > 30 and all(hasattr(ctypes.CDLL(str(library)), name) for name in names)
     assert fmpy.validation.validate_fmu(str(path)) == []
+    units = {variable.name: variable.unit for variable in fmpy.read_model_description(str(path)).modelVariables}
+    assert units["command.generator_torque"] == "N m" and units["state.rotor_speed"] == "rad/s"
 
 
 SLAVE = """

@@ -136,21 +136,13 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
 
 def test_a_run_has_its_own_cost_and_command(tmp_path):
     config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=7200.0)
-    found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",), mpc_iterations=1), config.plant()
-    assert found["MPC, exact, held"]["details"]["gradients"] <= 3
+    found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",), mpc_horizon=3600.0), config.plant()
     planned = ["MPC, exact, held", "MPC, fitted, held"]
-    assert list(found) == ["clairvoyant", "on-off", "on-off, resting", "PI", "model-based", "model-free", *planned]
+    assert list(found) == ["clairvoyant", "on-off", "PI", "model-based", "model-free", *planned]
     episodes = UnseenEpisodes(plant, 2)
     judged = episodes.judge(episodes.fly_baseline(OnOffValve(plant)))
     assert found["on-off"]["costs"] == judged.control_costs.tolist()
     assert min(map(mean, found.values())) == mean(found["clairvoyant"])
-
-
-def test_solves_have_the_recipes_window_with_what_is_asked_for():
-    module, window = recipe("limit"), PredictiveConfig(horizon=2.0, iterations=7)
-    assert module.chosen_window(module.Config(), window) == window
-    found = module.chosen_window(module.Config(mpc_horizon=8.0, mpc_iterations=60, mpc_tolerance=1e-6), window)
-    assert found == dataclasses.replace(window, horizon=8.0, iterations=60, tolerance=1e-6)
 
 
 def test_results_are_standard_json(tmp_path):

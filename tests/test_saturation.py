@@ -1,6 +1,7 @@
 """Saturation properties against CoolProp, and the cache of their fit."""
 
 import math
+from importlib.metadata import PackageNotFoundError
 
 import CoolProp.CoolProp as CP
 import numpy as np
@@ -169,6 +170,15 @@ def test_a_damaged_cache_is_fitted_again(own_cache, how, monkeypatch):
     saturation.coefficients.cache_clear()
     monkeypatch.setattr(saturation, "fit", forbidden)
     assert torch.equal(Saturation().table, whole)  # the file was mended
+
+
+def test_without_coolprop_the_extra_is_named(own_cache, monkeypatch):
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(saturation, "version", missing)
+    with pytest.raises(ValueError, match=r"fluids need CoolProp: .*rt_torchrl\[tank\]"):
+        Saturation()
 
 
 def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):

@@ -48,8 +48,7 @@ def _packaged() -> Benchmark:
         from nonlinear_benchmarks import Cascaded_Tanks
     except ImportError as error:
         raise ValueError(
-            "the record needs the package nonlinear-benchmarks: install the extra, pip install 'rt_torchrl[records]', "
-            "or give a file, --data FILE."
+            "the record needs a package: pip install nonlinear-benchmarks, or give a file, --data FILE."
         ) from error
     try:
         estimation, test = Cascaded_Tanks()

@@ -6,7 +6,7 @@ import math
 import zipfile
 import zlib
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +60,8 @@ class Saturation(nn.Module):
         high: greatest pressure [Pa].
 
     Raises:
-        ValueError: if CoolProp does not know the fluid, it is a mixture, or it does not boil over the whole range.
+        ValueError: if CoolProp is not installed or does not know the fluid, the fluid is a mixture, or it does not boil
+            over the whole range.
 
     Source: C. de Boor, *A Practical Guide to Splines*, chapter IX; I. H. Bell et al., *Ind. Eng. Chem. Res.* 53 (2014)
     2498 (CoolProp).
@@ -117,8 +118,12 @@ class Saturation(nn.Module):
 @cache
 def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
     """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
-    # Another version of CoolProp may have other equations of state.
-    path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
+    try:  # another version of CoolProp may have other equations of state
+        path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
+    except PackageNotFoundError as error:
+        raise ValueError(
+            "fluids need CoolProp: install the extra, pip install 'rt_torchrl[tank]', or run uv run --extra tank."
+        ) from error
     table = _load(path)
     if table is None:
         table, file = fit(fluid, low, high), io.BytesIO()

@@ -14,9 +14,9 @@ from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
 from rt_torchrl.evaluation.checks import visited_features as features_of
 from rt_torchrl.figures import style
 from rt_torchrl.figures.animation import Scene
-from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
+from rt_torchrl.figures.training import contours
 
 SPAN_SHARE = 0.7
 """Place of the angle of attack along the wing, from root 0 to tip 1; the outer wing makes most of the force."""

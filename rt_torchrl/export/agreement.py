@@ -1,9 +1,8 @@
-"""The comparison of an exported policy with the original."""
+"""What an export is made of and compared with: samples of signals, a sound copy of the policy, greatest differences."""
 
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,7 +12,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 
 TOLERANCE = 1e-6
-"""Greatest difference allowed, as a share of the action's range; computation in double precision needs 1e-12."""
+"""Greatest difference of a policy, as a share of the action's range; computation in double precision needs 1e-12."""
 OBSERVATIONS = 1000
 SEED = 20_250_131
 """Seed of the observations, which is the same for every export and is used in no training."""
@@ -28,9 +27,8 @@ def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED)
     """
     generator, columns = torch.Generator().manual_seed(seed), []
     for signal in signals:
-        like: dict[str, Any] = {"generator": generator, "dtype": torch.float64}
-        uniform, normal, exponent = torch.rand(count, **like), torch.randn(count, **like), torch.rand(count, **like)
-        unbounded = normal * 0.1 * 300.0**exponent
+        uniform, exponent = torch.rand(2, count, generator=generator, dtype=torch.float64)
+        unbounded = torch.randn(count, generator=generator, dtype=torch.float64) * 0.1 * 300.0**exponent
         if math.isfinite(signal.low) and math.isfinite(signal.high):
             column = signal.low + (signal.high - signal.low) * uniform
         elif math.isfinite(signal.low):
@@ -59,10 +57,10 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
             f"policy {name} cannot take float64 observations of shape (3, {n_o}) of plant {plant.name!r}: {error}"
         ) from error
     if not isinstance(actions, Tensor) or actions.shape != (3, n_a) or actions.dtype != torch.float64:
-        found = f"{actions.dtype} {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
+        returned = f"{actions.dtype} {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
         raise ValueError(
-            f"policy {name} returns {found} for 3 observations of plant {plant.name!r}; it must return torch.float64 "
-            f"(3, {n_a}). A module in single precision becomes double by .double()."
+            f"policy {name} returns {returned} for 3 observations of plant {plant.name!r}; it must return "
+            f"torch.float64 (3, {n_a}). A module in single precision becomes double by .double()."
         )
     changed = [buffer for buffer, value in policy.named_buffers() if not value.equal(before[buffer])]
     if changed:
@@ -73,8 +71,9 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     return policy
 
 
-def require_agreement(
-    policy: nn.Module, exported: Callable[[Float[Tensor, "n n_o"]], Tensor], plant: Plant, *, what: str
+@torch.no_grad()
+def require_policy(
+    policy: nn.Module, exported: Callable[[Float[Tensor, "n n_o"]], Tensor], plant: Plant, what: str
 ) -> float:
     """Compare an export with its policy on random observations, one, two and many at a time.
 
@@ -90,30 +89,77 @@ def require_agreement(
     Raises:
         ValueError: if the difference exceeds ``TOLERANCE``, or the policy's actions are not finite.
     """
-    observations = sample_observations(plant.observations, OBSERVATIONS)
-    with torch.no_grad():
-        expected = policy(observations)
-        found = torch.cat([exported(part) for part in observations.split([1, 2, OBSERVATIONS - 3])])
+    observations, name = sample_observations(plant.observations, OBSERVATIONS), type(policy).__name__
+    expected = policy(observations)
     if not expected.isfinite().all():
         worst = observations[(~expected.isfinite()).any(-1)][0].tolist()
-        raise ValueError(f"policy {type(policy).__name__} gives actions that are not finite at observation {worst}.")
-    errors = shares_of_range(found, expected, plant)
-    if errors.max() > TOLERANCE:
-        row, column = divmod(int(errors.argmax()), len(plant.actions))
-        raise ValueError(
-            f"{what} of policy {type(policy).__name__} differs from it by {errors.max().item():.2g} of the range of "
-            f"{plant.actions[column].name!r} at observation {observations[row].tolist()}; at most {TOLERANCE:g} is "
-            "allowed, and nothing was written. A policy must be a function of the observation alone: no random number, "
-            "no memory, no use of the batch as a whole."
-        )
-    return errors.max().item()
+        raise ValueError(f"policy {name} gives actions that are not finite at observation {worst}.")
+    actions = torch.cat([exported(part) for part in observations.split([1, 2, OBSERVATIONS - 3])])
+    return require_close(
+        actions,
+        expected,
+        action_sizes(plant, expected),
+        TOLERANCE,
+        plant.actions,
+        f"{what} of policy {name}",
+        [f"observation {row}" for row in observations.tolist()],
+        " A policy must be a function of the observation alone: no random number, no memory, no use of the batch as a "
+        "whole.",
+    )
 
 
-def shares_of_range(
-    found: Float[Tensor, "n n_a"], expected: Float[Tensor, "n n_a"], plant: Plant
-) -> Float[Tensor, "n n_a"]:
-    """Differences of actions over their ranges or, without a range, over their greatest sizes; infinite for NaN."""
+def action_sizes(plant: Plant, actions: Float[Tensor, "n n_a"]) -> Float[Tensor, " n_a"]:
+    """The ranges of the actions; of an action without range, its greatest size."""
     low, high = bounds(plant.actions)
     ranges = high - low
-    size = torch.where(ranges.isfinite(), ranges, expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny))
-    return ((found - expected).abs() / size).nan_to_num(nan=math.inf)
+    return torch.where(ranges.isfinite(), ranges, sizes(actions))
+
+
+def sizes(values: Float[Tensor, "n m"]) -> Float[Tensor, " m"]:
+    """The greatest finite size of every column."""
+    finite = values.abs().nan_to_num(nan=0.0, posinf=0.0)
+    return finite.amax(0).clamp(min=torch.finfo(torch.float64).tiny)
+
+
+def shares(
+    values: Float[Tensor, "n m"], expected: Float[Tensor, "n m"], of: Float[Tensor, " m"]
+) -> Float[Tensor, "n m"]:
+    """Differences as shares of sizes; infinite where one of both alone is not finite."""
+    equal = (values == expected) | (values.isnan() & expected.isnan())
+    return torch.where(equal, 0.0, ((values - expected).abs() / of).nan_to_num(nan=math.inf))
+
+
+def require_close(
+    values: Float[Tensor, "n m"],
+    expected: Float[Tensor, "n m"],
+    of: Float[Tensor, " m"],
+    tolerance: float,
+    signals: Sequence[Signal],
+    what: str,
+    rows: Sequence[object],
+    hint: str = "",
+) -> float:
+    """The greatest difference of an export's values from the original ones, as a share of the signals' sizes.
+
+    Args:
+        values: values of the export.
+        expected: values of what it was made of.
+        of: sizes of the signals.
+        tolerance: greatest difference that is allowed.
+        signals: the signals, for the message.
+        what: name of the export.
+        rows: description of every row.
+        hint: end of the message.
+
+    Raises:
+        ValueError: if the tolerance is exceeded.
+    """
+    errors = shares(values, expected, of)
+    if errors.max() > tolerance:
+        row, column = divmod(int(errors.argmax()), len(signals))
+        raise ValueError(
+            f"{what} differs from the original by {errors.max().item():.2g} of the range or size of "
+            f"{signals[column].name!r} at {rows[row]}; at most {tolerance:g} is allowed, and nothing was written."
+            f"{hint}"
+        )
+    return errors.max().item()

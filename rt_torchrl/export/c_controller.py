@@ -1,19 +1,51 @@
 """A controller as a C99 file: from the measured signals of a plant to its action, with filters and integrals."""
 
 import ctypes
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.export.agreement import SEED, detached
-from rt_torchrl.export.c_file import CFile, signal_table
+from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_close, shares
+from rt_torchrl.export.c_file import (
+    TracedFunction,
+    add_function,
+    c_array,
+    called,
+    frozen,
+    require_names,
+    signal_table,
+    source_of,
+    traced,
+    write_c,
+)
 from rt_torchrl.export.controller import Controller
-from rt_torchrl.export.controller_check import ControllerAgreement, Layout, fly
-from rt_torchrl.export.traced_function import TracedFunction, frozen, traced, weights_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.c_source import CSource, literal
 from rt_torchrl.programs.tracer import Tracer
+
+TOLERANCE = 1e-9
+"""Greatest difference of a controller in C from that in torch, as a share of the action's range."""
+INTERVALS = 1000
+"""Greatest number of control intervals of the flight on which both are compared."""
+
+
+class ControllerAgreement(NamedTuple):
+    """The comparison of a controller in C over the first intervals of an episode that it flies.
+
+    Args:
+        difference: greatest difference of an action from that of the controller in torch, as a share of its range.
+        from_plant: greatest difference from the policy on the plant's own states, whose filters know the measured
+            states within an interval too.
+        intervals: number of intervals.
+    """
+
+    difference: float
+    from_plant: float
+    intervals: int
 
 
 def export_controller(
@@ -42,16 +74,10 @@ def export_controller(
             traced (the message names the line), a controller state depends on the closure, the file does not compile,
             or the controller in C differs from that in torch.
     """
-    file = CFile(path, f"{plant.name}_controller" if name is None else name)
-    written = CController(Controller(plant, frozen(detached(policy, plant))), file.name)
-
-    def compare(library: ctypes.CDLL) -> ControllerAgreement:
-        return fly(written.controller, library, file.name, written.layout)
-
-    return file.write(written.comment(), written.declarations(), written.source(), compare)
-
-
-TIME = {("t", 0): "t"}
+    name = f"{plant.name}_controller" if name is None else name
+    path = require_names(path, name)
+    written = CController(Controller(plant, frozen(detached(policy, plant))), name)
+    return write_c(path, name, written.comment(), written.declarations(), written.source(), written.fly)
 
 
 class CController:
@@ -66,63 +92,45 @@ class CController:
     """
 
     def __init__(self, controller: Controller, name: str):
-        self.controller, self.name = controller, name
+        self.controller, self.name, plant = controller, name, controller.plant
         self.parts = _traced(controller)
-        plant, parts = controller.plant, self.parts.values()
-        states = set().union(*(part.reads(word) for part in parts for word in ("measured", "following")))
-        inputs = set().union(*(part.reads("inputs") for part in parts))
-        self.layout = Layout(sorted(states), sorted(inputs), len(controller.held), len(plant.actions))
-        self._signals = [plant.states[controller.measured[k]] for k in self.layout.states]
-        self._signals += [plant.inputs[k] for k in self.layout.inputs]
+        functions = [function for function, _ in self.parts.values()]
+        self.read = sorted(set().union(*(f.reads(word) for f in functions for word in ("measured", "last"))))
+        every = [*(plant.states[k] for k in controller.measured), *plant.inputs]
+        self.signals = [every[k] for k in self.read]
+        lengths = {"command": len(plant.actions), "memory": len(controller.held), "last": len(self.signals)}
+        self.arrays = {array: n for array, n in lengths.items() if n}
 
     def source(self) -> CSource:
-        """The functions ``init`` and ``step``, and what they call."""
-        name, last = self.name, [f"state->last[{k}] = measured[{k}];" for k in range(self.layout.n_last)]
-        source = CSource(weights_of({"policy": self.controller.policy}))
-        memory, command = self._array("memory", self.layout.n_memory), self._array("command", self.layout.n_actions)
-        now, before = self._signals_in("measured"), self._signals_in("state->last")
-        start, act = self.parts["start"], self.parts["act"]
-        settled = list(zip(memory.values(), start.outputs["memory"], strict=True))
-        rest = ["state->steps = 0;", *(f"{place} = 0.0;" for place in command.values()), *last]
+        """The functions ``init`` and ``step``, and those that they call."""
+        name, source = self.name, source_of("policy", self.controller.policy)
+        dt, places = literal(self.controller.plant.dt), dict.fromkeys(("measured", "last"), self.read)
+        calls = {}
+        for part, (function, example) in self.parts.items():
+            head = add_function(source, f"{name}_{part}", function, example, places, kind="static void")
+            given = {"memory": "0", "last": "0", "next": "state->memory"}  # 0 where there is no such array
+            given |= {array: f"state->{array}" for array in self.arrays}
+            given["t"] = f"{dt} * (double)(state->steps - 1)" if part == "advance" else f"{dt} * (double)state->steps"
+            arguments = re.findall(r"(\w+)(?=[,)])", head)
+            calls[part] = f"{name}_{part}({', '.join(given.get(word, word) for word in arguments)});"
+        last = [f"state->last[{k}] = measured[{k}];" for k in range(len(self.signals))]
+        rest = [f"state->command[{k}] = 0.0;" for k in range(self.arrays["command"])]
+        held = bool(self.controller.held)
         head = f"void {name}_init({name}_state *state, const double *measured)"
-        source.add(head, start.program, now, settled, last=rest)
-        arguments = f"(double t, {name}_state *state, const double *measured"
-        actions = [(f"action[{k}]", value) for k, value in enumerate(act.outputs["applied"])]
-        actions += list(zip(command.values(), act.outputs["command"], strict=True))
-        head = f"static void {name}_act{arguments}, double *action)"
-        source.add(head, act.program, TIME | memory | now, actions)
-        dt = literal(self.controller.plant.dt)
-        steps = [f"{name}_act({dt} * (double)state->steps, state, measured, action);", *last, "state->steps += 1;"]
-        if self.controller.held:
-            advance = self.parts["advance"]
-            following = {("following", k): place for (array, k), place in now.items() if array == "measured"}
-            ends = list(zip(memory.values(), advance.outputs["memory"], strict=True))
-            given = TIME | memory | before | command | following
-            source.add(f"static void {name}_advance{arguments})", advance.program, given, ends)
-            call = f"    {name}_advance({dt} * (double)(state->steps - 1), state, measured);"
-            steps = ["if (state->steps > 0) {", call, "}", *steps]
-        source.write(f"void {name}_step({name}_state *state, const double *measured, double *action)", steps)
+        source.write(head, [*([calls["start"]] if held else []), "state->steps = 0;", *rest, *last])
+        before = [f"if (state->steps > 0) {calls['advance']}"] if held else []
+        head = f"void {name}_step({name}_state *state, const double *measured, double *action)"
+        source.write(head, [*before, calls["act"], *last, "state->steps += 1;"])
         return source
-
-    @staticmethod
-    def _array(array: str, size: int) -> dict[tuple[str, int], str]:
-        """The places in C of an array of the state."""
-        return {(array, k): f"state->{array}[{k}]" for k in range(size)}
-
-    def _signals_in(self, array: str) -> dict[tuple[str, int], str]:
-        """The place in C of every measured state and input that is read."""
-        keys = [*(("measured", k) for k in self.layout.states), *(("inputs", k) for k in self.layout.inputs)]
-        return {key: f"{array}[{place}]" for place, key in enumerate(keys)}
 
     def declarations(self) -> list[str]:
         """The state of a controller and the functions."""
-        layout, name = self.layout, self.name
+        name = self.name
+        says = {"command": " /* what the policy asked for last */", "last": " /* what was measured last */"}
         return [
             "typedef struct {",
             "    unsigned long long steps; /* control intervals since the start */",
-            f"    double command[{layout.n_actions}]; /* what the policy asked for last */",
-            *([f"    double memory[{layout.n_memory}];"] if layout.n_memory else []),
-            *([f"    double last[{layout.n_last}]; /* what was measured last */"] if layout.n_last else []),
+            *(f"    double {array}[{n}];{says.get(array, '')}" for array, n in self.arrays.items()),
             f"}} {name}_state;",
             "",
             f"void {name}_init({name}_state *state, const double *measured);",
@@ -133,13 +141,12 @@ class CController:
         """The lines of the header."""
         plant, name = self.controller.plant, self.name
         held = [plant.states[k] for k in self.controller.held]
-        n_last, n_actions = max(1, self.layout.n_last), self.layout.n_actions
         return [
             f"{name}: a controller of the plant {plant.name} ({type(self.controller.policy).__name__}), written by",
             "rt_torchrl. It allocates nothing and needs only math.h. Each controller has a state of its own.",
             "",
             f"    {name}_state state;",
-            f"    double measured[{n_last}], action[{n_actions}];",
+            f"    double measured[{max(1, len(self.signals))}], action[{len(plant.actions)}];",
             "    ...read measured...",
             f"    {name}_init(&state, measured);",
             f"    ...every {plant.dt:g} s read measured...",
@@ -148,12 +155,61 @@ class CController:
             "init is called once, before the first step. step is called at the start of every control interval, over",
             "which its action is held.",
             "",
-            *signal_table({"measured": self._signals, "action": plant.actions, "state.memory": held}),
+            *signal_table({"measured": self.signals, "action": plant.actions, "state.memory": held}),
             "",
             "The action is what the actuators make of the command of the policy, such as within rate limits. The",
             "command is in state.command.",
             *(MEMORY if held else []),
         ]
+
+    @torch.no_grad()
+    def fly(self, library: ctypes.CDLL) -> ControllerAgreement:
+        """Fly the plant by the controller in C, and give the same measurements to the controller in torch.
+
+        Raises:
+            ValueError: if the two differ by more than ``TOLERANCE``.
+        """
+        plant, generator = self.controller.plant, torch.Generator().manual_seed(SEED)
+        state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+        in_c, in_torch, ideal = (torch.cat(x) for x in zip(*self._actions(library, state, exogenous), strict=True))
+        of = action_sizes(plant, in_torch)
+        what, rows = f"the controller {self.name} in C", [f"interval {k}" for k in range(len(in_c))]
+        difference = require_close(in_c, in_torch, of, TOLERANCE, plant.actions, what, rows)
+        return ControllerAgreement(difference, shares(in_c, ideal, of).max().item(), len(in_c))
+
+    def _actions(
+        self, library: ctypes.CDLL, state: Tensor, exogenous: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """The action of every interval in C, in torch, and with the plant's own states; the one in C acts."""
+        controller, plant, held = self.controller, self.controller.plant, self.controller.held
+        memory, measured = state[:, held], state[:, controller.measured]
+        command = state.new_zeros(1, len(plant.actions))
+        fields = [("steps", ctypes.c_ulonglong), *((array, ctypes.c_double * n) for array, n in self.arrays.items())]
+        in_c: Any = type("State", (ctypes.Structure,), {"_fields_": fields})()
+        self._call(library, "init", in_c, measured, exogenous[:, 0])
+        settled, started = list(getattr(in_c, "memory", [])), controller.start(measured, exogenous[:, 0])
+        if not torch.allclose(started.new_tensor([settled]), started, rtol=TOLERANCE, atol=TOLERANCE):
+            raise ValueError(f"{self.name}_init in C starts at {settled} instead of {started.tolist()[0]}.")
+        if held:
+            in_c.memory[:] = memory[0].tolist()
+        for k in range(min(plant.n_steps, INTERVALS)):
+            t, inputs, following = state.new_tensor([k * plant.dt]), exogenous[:, k], state[:, controller.measured]
+            if k > 0 and held:
+                memory = controller.advance(t - plant.dt, memory, measured, exogenous[:, k - 1], command, following)
+            measured = following
+            applied = self._call(library, "step", in_c, measured, inputs, len(plant.actions))
+            command = state.new_tensor([list(in_c.command)])
+            expected, ideal = (controller.act(t, x, measured, inputs)[1] for x in (memory, state[:, held]))
+            yield applied, expected, ideal
+            state = plant.step(t, state, command, inputs, plant.closure).state
+            if not state.isfinite().all():  # the plant has left its range; what follows is no flight
+                return
+
+    def _call(
+        self, library: ctypes.CDLL, part: str, in_c: Any, measured: Tensor, inputs: Tensor, count: int = 0
+    ) -> Tensor:
+        signals = c_array(torch.cat([measured, inputs], -1)[0, self.read].tolist())
+        return called(getattr(library, f"{self.name}_{part}"), [ctypes.byref(in_c), signals], count).unsqueeze(0)
 
 
 MEMORY = (
@@ -164,44 +220,47 @@ MEMORY = (
 )
 
 
-def _traced(controller: Controller) -> dict[str, TracedFunction]:
-    """The functions ``start``, ``act`` and, if the controller has states, ``advance``."""
-    plant, generator = controller.plant, torch.Generator().manual_seed(SEED)
+def _traced(controller: Controller) -> dict[str, tuple[TracedFunction, dict[str, Tensor]]]:
+    """The function ``act``; of a controller with states also ``start`` and ``advance``; examples of their arguments.
+
+    Measured states and inputs are one argument, ``measured``; those of the interval before are ``last``.
+    """
+    plant, generator, n = controller.plant, torch.Generator().manual_seed(SEED), len(controller.measured)
     state, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
-    signals = {"measured": state[:, controller.measured], "inputs": inputs}
-    now = {"t": state.new_zeros(1), "memory": state[:, controller.held], **signals}
-    what, modules = f"the controller of plant {plant.name!r}", [controller.policy]
+    measured, what = torch.cat([state[:, controller.measured], inputs], -1), f"the controller of plant {plant.name!r}"
 
-    def act(**given: Tensor) -> dict[str, Tensor]:
-        return dict(zip(("command", "applied"), controller.act(**given), strict=True))
+    def start(measured: Tensor) -> dict[str, Tensor]:
+        return {"next": controller.start(measured[:, :n], measured[:, n:])}
 
-    parts = {
-        "start": traced(what, lambda **given: {"memory": controller.start(**given)}, signals),
-        "act": traced(what, act, now, modules),
-    }
-    if controller.held:
-        with torch.no_grad():
-            command, _ = controller.act(**now)
-        given = {**now, "command": command, "following": signals["measured"]}
-        parts["advance"] = _advance(what, controller, given)
-    return parts
-
-
-def _advance(what: str, controller: Controller, given: dict[str, Tensor]) -> TracedFunction:
-    controller.closure = unknown = UnknownClosure(controller.plant.closure)
-    try:
-        with torch.no_grad():
-            controller.advance(**given)
-        found = traced(what, lambda **x: {"memory": controller.advance(**x)}, given, prepare=unknown.begin)
-    finally:
-        controller.closure = controller.plant.closure
-    if found.reads("closure"):
-        names = ", ".join(controller.plant.controller_states)
-        raise ValueError(
-            f"{what} cannot be exported: its states ({names}) depend on the closure, which a controller does not know. "
-            "Name in controller_states only what follows from measured signals."
+    def act(t: Tensor, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
+        return dict(
+            zip(("command", "action"), controller.act(t, memory, measured[:, :n], measured[:, n:]), strict=True)
         )
-    return found
+
+    def advance(t: Tensor, memory: Tensor, last: Tensor, command: Tensor, measured: Tensor) -> dict[str, Tensor]:
+        following = measured[:, :n]
+        return {"next": controller.advance(t, memory, last[:, :n], last[:, n:], command, following)}
+
+    now = {"t": state.new_zeros(1), "memory": state[:, controller.held], "measured": measured}
+    parts = {"act": (traced(what, act, now, controller.policy), now)}
+    if not controller.held:
+        return parts
+    parts["start"] = traced(what, start, {"measured": measured}), {"measured": measured}
+    with torch.no_grad():
+        given = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
+        given["measured"] = measured
+        controller.closure = unknown = UnknownClosure(plant.closure)
+        try:
+            advance(**given)
+            parts["advance"] = traced(what, advance, given, prepare=unknown.begin), given
+        finally:
+            controller.closure = plant.closure
+    if parts["advance"][0].reads("closure"):
+        raise ValueError(
+            f"{what} cannot be exported: its states ({', '.join(plant.controller_states)}) depend on the closure, "
+            "which a controller does not know. Name in controller_states only what follows from measured signals."
+        )
+    return parts
 
 
 class UnknownClosure(nn.Module):
@@ -219,9 +278,9 @@ class UnknownClosure(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         if self._tracer is None:
-            found: Tensor = self.closure(features)
-            self._shapes.append(found.shape)
-            return found
+            values: Tensor = self.closure(features)
+            self._shapes.append(values.shape)
+            return values
         values = torch.zeros(self._shapes.pop(0), dtype=torch.float64)
         self._tracer.input(values, "closure")
         return values

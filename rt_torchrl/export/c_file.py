@@ -1,81 +1,263 @@
-"""A C file with its header, which are written together after a check."""
+"""Functions of tensors as a C99 file with its header: traced, compiled, called, and written after a comparison."""
 
+import contextlib
+import copy
 import ctypes
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.export.c_compiler import checked
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.programs.c_source import CSource
+from rt_torchrl.programs.program import Program, UntraceableError
+from rt_torchrl.programs.rules import new_tracer
+from rt_torchrl.programs.tracer import Tracer
 
-Found = TypeVar("Found")
+COMPILERS = ("cc", "gcc", "clang")
+STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+REMEDY = "Write it with arithmetic of torch in float64; the formats pt2 and onnx take more of a policy than C does."
+Module = TypeVar("Module", bound=nn.Module)
+Result = TypeVar("Result")
 
 
-class CFile:
-    """A C file and its header of the same name.
+class TracedFunction(NamedTuple):
+    """A program with the values of its outputs.
 
     Args:
-        path: the C file, which ends in ``.c``.
-        name: name of its function, or the prefix of its functions.
-
-    Raises:
-        ValueError: if the path has another suffix, or C does not take the name.
+        program: the program; its inputs have the name of an argument and a position.
+        outputs: values of every output.
     """
 
-    def __init__(self, path: Path | str, name: str):
-        self.path, self.name = Path(path), name
-        if self.path.suffix != ".c":
-            raise ValueError(f"path={path} of a C file must end in .c; the header's name is made of it.")
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-            raise ValueError(f"function={name!r} must be a name in C, such as blade_controller.")
+    program: Program
+    outputs: dict[str, list[int]]
 
-    def write(
-        self,
-        comment: Sequence[str],
-        declarations: Sequence[str],
-        source: CSource,
-        compare: Callable[[ctypes.CDLL], Found],
-    ) -> Found | None:
-        """Check and write both files.
+    def reads(self, name: str) -> set[int]:
+        """The positions of an argument that the outputs depend on."""
+        needed = self.program.needed(value for values in self.outputs.values() for value in values)
+        operations = [self.program.operations[value] for value in needed]
+        return {o.attributes[1] for o in operations if o.name == "input" and o.attributes[0] == name}
 
-        Args:
-            comment: lines of the comment at the top of the header.
-            declarations: lines of C in the header.
-            source: the functions.
-            compare: comparison of the loaded library, which raises ValueError on a difference.
 
-        Returns:
-            The result of the comparison; None without a compiler.
+def frozen(module: Module) -> Module:
+    """A copy of a module on the CPU, in evaluation mode, whose weights share no memory and take no gradients."""
+    module = copy.deepcopy(module).cpu().eval().requires_grad_(False)
+    for weight in module.parameters():
+        weight.data = weight.data.clone()
+    return module
 
-        Raises:
-            ValueError: if the file does not compile, or the comparison fails; then nothing is written.
-        """
-        header = self.path.with_suffix(".h")
-        texts = {
-            header: header_text(self.name, comment, declarations),
-            self.path: source_text(header.name, source.text()),
-        }
-        found = checked({path.name: text for path, text in texts.items()}, self.name, compare)
-        for path, text in texts.items():
-            write_atomically(path, text.encode("utf-8"))
-        return found
+
+def traced(
+    what: str,
+    function: Callable[..., Mapping[str, Tensor]],
+    arguments: Mapping[str, Tensor],
+    module: nn.Module | None = None,
+    *,
+    prepare: Callable[[Tracer], None] | None = None,
+) -> TracedFunction:
+    """Trace a function of vectors, one realisation.
+
+    Args:
+        what: name of the function, for messages.
+        function: function of tensors that returns tensors by name.
+        arguments: example of every argument, with one realisation.
+        module: module from :func:`frozen` whose weights the C file holds.
+        prepare: called with the tracer before the function is.
+
+    Raises:
+        UntraceableError: if the function cannot become a program; the message names the reason and the line.
+    """
+    tracer, entered = new_tracer(), list[str]()
+    given = {name: value.clone() for name, value in arguments.items()}
+    try:
+        for name, value in given.items():
+            tracer.input(value, name)
+        for weight in [] if module is None else module.parameters():
+            tracer.weight(weight)
+        if prepare is not None:
+            prepare(tracer)
+        with torch.no_grad(), tracer.following(), _noted(module, entered):
+            results = function(**given)
+        outputs = {name: tracer.outputs(value) for name, value in results.items()}
+    except UntraceableError as error:
+        layer = f"layer {entered[-1]} of " if entered else ""
+        raise UntraceableError(f"{layer}{what} cannot be written in C: {error}. {REMEDY}") from error
+    return TracedFunction(tracer.program, outputs)
+
+
+@contextlib.contextmanager
+def _noted(module: nn.Module | None, entered: list[str]) -> Iterator[None]:
+    """A context in which ``entered`` holds the names of the layers whose call has begun and not ended."""
+    hooks = []
+    for path, layer in [] if module is None else module.named_modules():
+        if path:
+            name = f"{path!r} ({type(layer).__name__})"
+            hooks.append(layer.register_forward_pre_hook(lambda *_, name=name: entered.append(name)))
+            hooks.append(layer.register_forward_hook(lambda *_: entered.pop() and None))
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def source_of(role: str, module: nn.Module) -> CSource:
+    """The beginning of a C file, with the weights of a module in the order in which :func:`traced` numbers them."""
+    return CSource(
+        [
+            (f"{role} {name} {tuple(weight.shape)}", weight.detach().flatten().tolist())
+            for name, weight in module.named_parameters()
+        ]
+    )
+
+
+def add_function(
+    source: CSource,
+    name: str,
+    function: TracedFunction,
+    example: Mapping[str, Tensor],
+    places: Mapping[str, Sequence[int]] | None = None,
+    kind: str = "void",
+) -> str:
+    """Add a function to a C file, and return its declaration; the outputs are its last arguments.
+
+    Args:
+        source: the C file.
+        name: name in C.
+        function: the traced function.
+        example: its arguments. Those of one dimension are numbers in C, those of two are arrays.
+        places: positions of the elements of an argument that its array in C has; by default all.
+        kind: what stands before the name.
+    """
+    inputs, declared = dict[tuple[str, int], str](), list[str]()
+    for argument, value in example.items():
+        if value.ndim == 1:
+            declared.append(f"double {argument}")
+            inputs[argument, 0] = argument
+            continue
+        declared.append(f"const double *{argument}")
+        taken = (places or {}).get(argument, range(value.shape[1]))
+        inputs |= {(argument, k): f"{argument}[{place}]" for place, k in enumerate(taken)}
+    outputs = [(f"{output}[{k}]", x) for output, values in function.outputs.items() for k, x in enumerate(values)]
+    declared += [f"double *{output}" for output in function.outputs]
+    head = f"{kind} {name}({', '.join(declared)})"
+    source.add(head, function.program, inputs, outputs)
+    return head
+
+
+def answers(function: Any, points: Mapping[str, Tensor], count: int) -> Tensor:
+    """What a compiled function of :func:`add_function` gives for every row of its arguments, ``count`` numbers each."""
+    columns = [x.tolist() for x in points.values()]
+    rows = (
+        [c_array(x) if isinstance(x, list) else ctypes.c_double(x) for x in row] for row in zip(*columns, strict=True)
+    )
+    return torch.stack([called(function, row, count) for row in rows])
+
+
+def c_array(numbers: Sequence[float]) -> ctypes.Array[ctypes.c_double]:
+    """An array of doubles for a call."""
+    return (ctypes.c_double * max(1, len(numbers)))(*numbers)
+
+
+def called(function: Any, arguments: Sequence[Any], count: int) -> Tensor:
+    """The ``count`` numbers that a function writes into the array after its arguments."""
+    out = c_array([math.nan] * count)
+    function.restype = None
+    function(*arguments, out)
+    return torch.tensor(list(out)[:count], dtype=torch.float64)
+
+
+def compiler() -> str | None:
+    """The compiler of this machine; None if it has none."""
+    return next(filter(None, map(shutil.which, COMPILERS)), None)
+
+
+def compile_c(compiler: str, file: Path, *options: str) -> Path:
+    """Compile a C file to a shared library beside it.
+
+    Raises:
+        ValueError: if the compiler refuses the file.
+    """
+    library = file.with_suffix(".so")
+    command = [compiler, "-std=c99", "-O1", "-shared", "-fPIC", *options, str(file), "-o", str(library), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"the C file could not be compiled by `{' '.join(command)}`: {done.stderr.strip()}")
+    return library
+
+
+def require_names(path: Path | str, name: str) -> Path:
+    """The path of a C file, after a check of it and of the name of its functions.
+
+    Raises:
+        ValueError: if the path does not end in ``.c``, or C does not take the name.
+    """
+    if Path(path).suffix != ".c":
+        raise ValueError(f"path={path} of a C file must end in .c; the header's name is made of it.")
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ValueError(f"function={name!r} must be a name in C, such as blade_controller.")
+    return Path(path)
+
+
+def write_c(
+    path: Path,
+    name: str,
+    comment: Sequence[str],
+    declarations: Sequence[str],
+    source: CSource,
+    compare: Callable[[ctypes.CDLL], Result],
+) -> Result | None:
+    """Write a C file and its header of the same name, after they were compiled and compared with what they are made of.
+
+    Args:
+        path: the C file.
+        name: name of its function, or the prefix of its functions.
+        comment: lines of the comment at the top of the header.
+        declarations: lines of C in the header.
+        source: the functions.
+        compare: comparison of the loaded library, which raises ValueError on a difference.
+
+    Returns:
+        The result of the comparison; None without a compiler, of which a warning tells.
+
+    Raises:
+        ValueError: if the file does not compile without a warning, or the comparison fails; then nothing is written.
+    """
+    header, result, found = path.with_suffix(".h"), None, compiler()
+    note = f"/* See {header.name} for what goes in and out. Written by rt_torchrl; do not edit. */"
+    texts = {
+        header: header_text(name, comment, declarations),
+        path: f'{note}\n\n#include "{header.name}"\n\n#include <math.h>\n\n{source.text()}',
+    }
+    if found is None:
+        warnings.warn(
+            f"{name} was not checked: there is no C compiler here ({', '.join(COMPILERS)}). Compare it where you "
+            "compile it.",
+            stacklevel=3,
+        )
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            for file, text in texts.items():
+                Path(folder, file.name).write_text(text, encoding="utf-8")
+            result = compare(ctypes.CDLL(str(compile_c(found, Path(folder, path.name), *STRICT))))
+    for file, text in texts.items():
+        write_atomically(file, text.encode("utf-8"))
+    return result
 
 
 def header_text(name: str, comment: Sequence[str], declarations: Sequence[str]) -> str:
-    """The text of a header.
-
-    Args:
-        name: name in C from which the guard is made.
-        comment: lines of the comment at its top.
-        declarations: lines of C.
-    """
-    guard = f"{name.upper()}_H"
+    """The text of a header with a comment at its top."""
+    guard, declared = f"{name.upper()}_H", "\n".join(declarations)
     lines = "\n".join(f" * {line}".rstrip() for line in (line.replace("*/", "* /") for line in comment))
-    declared = "\n".join(declarations)
     return f"""/*
 {lines}
  */
@@ -94,12 +276,6 @@ extern "C" {{
 
 #endif
 """
-
-
-def source_text(header: str, content: str) -> str:
-    """The text of a C file with its header and the functions."""
-    note = f"/* See {header} for what goes in and out. Written by rt_torchrl; do not edit. */"
-    return f'{note}\n\n#include "{header}"\n\n#include <math.h>\n\n{content}'
 
 
 def signal_table(arrays: Mapping[str, Sequence[Signal]]) -> list[str]:

@@ -11,11 +11,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.export.agreement import sample_observations
-from rt_torchrl.export.c_compiler import COMPILERS, c_array, called, compile_c, compiler
-from rt_torchrl.export.onnx_model import require_packages, runtime
+from rt_torchrl.export.c_file import COMPILERS, answers, compile_c, compiler
+from rt_torchrl.export.program import onnx_runtime
 from rt_torchrl.plants.plant import Plant
 
-KINDS = (".pt2", ".onnx", ".c")
 WITH_CODE = (".pt2", ".c")
 """Kinds of files that run code of their own."""
 DECLARED = re.compile(r"^void (\w+)\(const double \*observation, double \*action\);", re.MULTILINE)
@@ -56,86 +55,65 @@ def load_policy(path: Path | str, plant: Plant, *, trusted: bool = False) -> Exp
             needs a package or compiler that is not there, or it takes other observations or returns other actions than
             those of the plant.
     """
-    file = Path(path)
-    if file.suffix not in KINDS or not file.is_file():
-        raise ValueError(f"policy={str(path)!r} must be a file that ends in {', '.join(KINDS)}; see recipes/export.py.")
+    file, kinds = Path(path), {".pt2": _program, ".onnx": _onnx, ".c": _c}
+    observations, actions = ([signal.name for signal in signals] for signals in (plant.observations, plant.actions))
+    if file.suffix not in kinds or not file.is_file():
+        raise ValueError(f"policy={str(path)!r} must be a file that ends in {', '.join(kinds)}; see recipes/export.py.")
     if file.suffix in WITH_CODE and not trusted:
         raise ValueError(
             f"policy={str(path)!r} is code that would run here: a .pt2 file may hold pickled objects, C is compiled "
             "and called. If you know who has written it, give trusted=True (--trusted of a recipe); an ONNX model "
             "needs no trust."
         )
-    load = {".pt2": _program, ".onnx": _onnx, ".c": _c}[file.suffix]
-    policy = ExportedPolicy(load(file, plant))
-    seen = sample_observations(plant.observations, 1)
+    policy = ExportedPolicy(kinds[file.suffix](file, plant))
     try:
-        found = policy(seen)
+        answer = policy(sample_observations(plant.observations, 1))
     except Exception as error:  # each runtime has errors of its own
-        names = [signal.name for signal in plant.observations]
         raise ValueError(
-            f"policy={str(path)!r} does not take the observations {names}: {str(error).strip()} Give what it observes."
+            f"policy={str(path)!r} does not take the observations {observations}: {str(error).strip()} Give what it "
+            "observes."
         ) from error
-    if found.shape[-1] != len(plant.actions) or not found.isfinite().all():
-        names = [signal.name for signal in plant.actions]
-        raise ValueError(f"policy={str(path)!r} answers {found.tolist()} instead of the actions {names}.")
+    if answer.shape[-1] != len(actions) or not answer.isfinite().all():
+        raise ValueError(f"policy={str(path)!r} answers {answer.tolist()} instead of the actions {actions}.")
     return policy
 
 
 def _program(file: Path, plant: Plant) -> Callable[[Tensor], Tensor]:
     try:
-        module = torch.export.load(str(file)).module()
+        return torch.export.load(str(file)).module()
     except Exception as error:  # torch.export raises many kinds
         raise ValueError(f"policy={str(file)!r} is no PyTorch program: {error}") from error
-    return lambda rows: module(rows)
 
 
 def _onnx(file: Path, plant: Plant) -> Callable[[Tensor], Tensor]:
-    require_packages(["onnxruntime"])
-    return runtime(file.read_bytes(), str(file))
+    return onnx_runtime(file.read_bytes(), str(file))
 
 
 def _c(file: Path, plant: Plant) -> Callable[[Tensor], Tensor]:
-    found = compiler()
+    found, header = compiler(), file.with_suffix(".h")
     if found is None:
         raise ValueError(f"policy={str(file)!r} needs a C compiler ({', '.join(COMPILERS)}), and there is none here.")
-    name = _function_of(file, plant)
-    with tempfile.TemporaryDirectory() as folder:
-        for source in (file.with_suffix(".h"), file):
-            (Path(folder) / source.name).write_bytes(source.read_bytes())
-        library = ctypes.CDLL(str(compile_c(found, Path(folder) / file.name)))
-    try:
-        function = getattr(library, name)
-    except AttributeError as error:
-        raise ValueError(
-            f"policy={str(file)!r} defines no function {name}; it is not the file of its header."
-        ) from error
-    return lambda rows: torch.stack([called(function, [c_array(row)], len(plant.actions)) for row in rows.tolist()])
-
-
-def _function_of(file: Path, plant: Plant) -> str:
-    """The name of the policy's function by its header, which must have the plant's numbers of signals."""
-    header = file.with_suffix(".h")
     text = header.read_text(encoding="utf-8", errors="replace") if header.is_file() else ""
     declared = DECLARED.search(text)
     name = declared[1] if declared else ""
-    signals = {
-        what: re.search(rf"^#define {name.upper()}_{what} (\d+)$", text, re.MULTILINE)
-        for what in ("OBSERVATIONS", "ACTIONS")
-    }
-    takes, returns = (int(number[1]) if number else 0 for number in signals.values())
-    if not (takes and returns):
-        raise ValueError(
-            f"policy={str(file)!r}: its header {header.name} is not beside it, or does not declare a policy as "
-            "export_c does; keep both files together."
-        )
-    if takes != len(plant.observations):
-        raise ValueError(
-            f"policy={str(file)!r} takes {takes} observations, and here are {len(plant.observations)}: it does not "
-            f"take the observations {[signal.name for signal in plant.observations]}. Give what it observes."
-        )
-    if returns != len(plant.actions):
-        raise ValueError(
-            f"policy={str(file)!r} returns {returns} actions, and here are {len(plant.actions)}: "
-            f"{[signal.name for signal in plant.actions]}. Give the plant that it acts on."
-        )
-    return name
+    expected = {"OBSERVATIONS": plant.observations, "ACTIONS": plant.actions}
+    numbers = {what: re.search(rf"^#define {name.upper()}_{what} (\d+)$", text, re.MULTILINE) for what in expected}
+    for what, signals in expected.items():
+        number = numbers[what]
+        if number is None:
+            raise ValueError(
+                f"policy={str(file)!r}: its header {header.name} is not beside it, or does not declare a policy as "
+                "export_c does; keep both files together."
+            )
+        if int(number[1]) != len(signals):
+            raise ValueError(
+                f"policy={str(file)!r} has {number[1]} {what.lower()}, and here are {len(signals)}: it does not go "
+                f"with {[signal.name for signal in signals]}. Give the plant that it was made for."
+            )
+    with tempfile.TemporaryDirectory() as folder:
+        for source in (header, file):
+            Path(folder, source.name).write_bytes(source.read_bytes())
+        function = getattr(ctypes.CDLL(str(compile_c(found, Path(folder, file.name)))), name, None)
+    if function is None:
+        raise ValueError(f"policy={str(file)!r} defines no function {name}; it is not the file of its header.")
+    return lambda rows: answers(function, {"observation": rows}, len(plant.actions))

@@ -1,75 +1,29 @@
 """A policy or a twin as an FMU for co-simulation, from the exported C, for Modelica tools and Simulink."""
 
+import io
 import platform
 import sys
 import tempfile
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from uuid import uuid4
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import torch
 from torch import nn
 
-from rt_torchrl.export.c_compiler import compile_c, compiler
-from rt_torchrl.export.c_policy import export_c
-from rt_torchrl.export.c_twin import export_twin
+from rt_torchrl.atomic_file import write_atomically
+from rt_torchrl.export.c_file import compile_c, compiler
+from rt_torchrl.export.c_function import export_c, export_twin
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 SYSTEMS = {"win32": "win", "darwin": "darwin"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FMUDescription:
-    """What ``modelDescription.xml`` says; a variable is called KIND.NAME, such as ``state.rotor_speed``.
-
-    Args:
-        name: name of the model and of its library.
-        token: what the library knows itself by.
-        dt: control interval [s].
-        inputs, outputs: kind and signal of each variable, in the order of the values.
-        values: values at the start.
-    """
-
-    name: str
-    token: str
-    dt: float
-    inputs: Sequence[tuple[str, Signal]]
-    outputs: Sequence[tuple[str, Signal]]
-    values: Sequence[float]
-
-    def text(self) -> str:
-        """The content of the file."""
-        rows = "".join(self._variable(k) for k in range(len(self.values)))
-        first, kinds = len(self.inputs) + 1, [kind for kind, _ in self.outputs]
-        unknowns = "".join(f'<Unknown index="{first + k}"/>' for k in range(len(kinds)))
-        calculated = "".join(f'<Unknown index="{first + k}"/>' for k, kind in enumerate(kinds) if kind != "state")
-        initials = f"<InitialUnknowns>{calculated}</InitialUnknowns>" if calculated else ""
-        return (
-            f'<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription fmiVersion="2.0" '
-            f'modelName={quoteattr(self.name)} guid="{self.token}" generationTool="rt_torchrl" '
-            f'variableNamingConvention="structured">'
-            f'<CoSimulation modelIdentifier="{self.name}" canHandleVariableCommunicationStepSize="true"/>'
-            f'<DefaultExperiment startTime="0" stepSize="{self.dt!r}"/><ModelVariables>{rows}</ModelVariables>'
-            f"<ModelStructure><Outputs>{unknowns}</Outputs>{initials}</ModelStructure></fmiModelDescription>\n"
-        )
-
-    def _variable(self, k: int) -> str:
-        kind, signal = (*self.inputs, *self.outputs)[k]
-        is_input = k < len(self.inputs)
-        # What a state starts with may be set; an action follows from the observation.
-        initial = "" if is_input else ' initial="exact"' if kind == "state" else ' initial="calculated"'
-        start = f' start="{self.values[k]!r}"' if is_input or kind == "state" else ""
-        return (
-            f'<ScalarVariable name={quoteattr(f"{kind}.{signal.name}")} valueReference="{k}" '
-            f'causality="{"input" if is_input else "output"}" variability="continuous"{initial} '
-            f"description={quoteattr(signal.unit)}><Real{start}/></ScalarVariable>"
-        )
+Variables = Sequence[tuple[str, Signal]]
+"""Kind and signal of each variable, which is called KIND.NAME, such as ``state.rotor_speed``."""
 
 
 def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None:
@@ -87,18 +41,14 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_c` refuses the
             policy.
     """
-    name = f"{plant.name}_policy"
-    n_o, n_a = len(plant.observations), len(plant.actions)
-    output = f"{name}(v, v + {n_o});"
-    inputs = [("observation", signal) for signal in plant.observations]
+    name, inputs = f"{plant.name}_policy", [("observation", signal) for signal in plant.observations]
     outputs = [("action", signal) for signal in plant.actions]
+    values = [0.0] * (len(inputs) + len(outputs))
     with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder) / "policy.c"
+        source = Path(folder, "policy.c")
         export_c(policy, source, plant, function=name)
-        described = FMUDescription(
-            name=name, token=_token(), dt=plant.dt, inputs=inputs, outputs=outputs, values=[0.0] * (n_o + n_a)
-        )
-        _write(path, described, source, output=output, step="")
+        calls = {"@OUTPUT@": f"{name}(v, v + {len(inputs)});", "@STEP@": "(void)t;"}
+        _write(path, name, plant.dt, inputs, outputs, values, source, calls)
 
 
 def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0) -> None:
@@ -117,55 +67,86 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_twin` refuses the
             twin.
     """
-    name = f"{plant.name}_twin"
-    n_a, n_z = len(plant.actions), len(plant.inputs)
-    first = plant.draw_initial_state(1, torch.Generator().manual_seed(seed))[0].tolist()
-    step = f"{name}_step(t, v + {n_a + n_z}, v, v + {n_a}, v + {n_a + n_z});"
+    name, n_a = f"{plant.name}_twin", len(plant.actions)
     inputs = [("command", s) for s in plant.actions] + [("exogenous", s) for s in plant.inputs]
-    outputs = [("state", signal) for signal in plant.states]
-    values = [0.0] * (n_a + n_z) + first
+    n, outputs = len(inputs), [("state", signal) for signal in plant.states]
+    values = [0.0] * n + plant.draw_initial_state(1, torch.Generator().manual_seed(seed))[0].tolist()
     with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder) / "twin.c"
+        source = Path(folder, "twin.c")
         export_twin(closure, source, plant, name=name)
-        described = FMUDescription(
-            name=name, token=_token(), dt=plant.dt, inputs=inputs, outputs=outputs, values=values
-        )
-        _write(path, described, source, output="(void)v;", step=step)
+        calls = {"@OUTPUT@": "(void)v;", "@STEP@": f"{name}_step(t, v + {n}, v, v + {n_a}, v + {n});"}
+        _write(path, name, plant.dt, inputs, outputs, values, source, calls)
 
 
-def _token() -> str:
-    return f"{{{uuid4()}}}"
-
-
-def _write(path: Path | str, described: FMUDescription, source: Path, *, output: str, step: str) -> None:
-    path, found, name = Path(path), compiler(), described.name
-    if path.suffix != ".fmu":
+def _write(
+    path: Path | str,
+    name: str,
+    dt: float,
+    inputs: Variables,
+    outputs: Variables,
+    values: Sequence[float],
+    source: Path,
+    calls: dict[str, str],
+) -> None:
+    found, token, content = compiler(), f"{{{uuid4()}}}", io.BytesIO()
+    if Path(path).suffix != ".fmu":
         raise ValueError(f"path={path} of an FMU must end in .fmu.")
     if found is None:
         raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
     text = files("rt_torchrl.export").joinpath("fmu.c").read_text(encoding="utf-8")
-    replaced = {
-        "@HEADER@": source.with_suffix(".h").name,
-        "@COUNT@": str(len(described.values)),
-        "@VALUES@": ", ".join(repr(value) for value in described.values),
-        "@INTERVAL@": repr(described.dt),
-        "@OUTPUT@": output,
-        "@STEP@": step or "(void)t;",
-        "@GUID@": described.token,
-    }
-    for word, value in replaced.items():
+    words = {"@HEADER@": source.with_suffix(".h").name, "@COUNT@": str(len(values)), "@GUID@": token}
+    words |= {"@INTERVAL@": repr(dt), "@VALUES@": ", ".join(map(repr, values))}
+    for word, value in (words | calls).items():
         text = text.replace(word, value)
     # One unit of translation, so that one call of the compiler makes the library.
     wrapper = source.with_name(f"{name}_fmu.c")
     wrapper.write_text(text + source.read_text(encoding="utf-8"), encoding="utf-8")
     library = compile_c(found, wrapper)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as fmu:
-        fmu.writestr("modelDescription.xml", described.text())
-        fmu.write(library, f"binaries/{_binaries()}/{name}{SUFFIXES.get(sys.platform, '.so')}")
+    folder = f"{SYSTEMS.get(sys.platform, 'linux')}{platform.architecture()[0].removesuffix('bit')}"
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as fmu:
+        fmu.writestr("modelDescription.xml", description(name, token, dt, inputs, outputs, values))
+        fmu.write(library, f"binaries/{folder}/{name}{SUFFIXES.get(sys.platform, '.so')}")
         for file in (wrapper, source.with_suffix(".h")):
             fmu.write(file, f"sources/{file.name}")
+    write_atomically(Path(path), content.getvalue())
 
 
-def _binaries() -> str:
-    """Folder of the library for this machine."""
-    return f"{SYSTEMS.get(sys.platform, 'linux')}{platform.architecture()[0].removesuffix('bit')}"
+def description(
+    name: str, token: str, dt: float, inputs: Variables, outputs: Variables, values: Sequence[float]
+) -> bytes:
+    """The content of ``modelDescription.xml``.
+
+    Args:
+        name: name of the model and of its library.
+        token: what the library knows itself by.
+        dt: control interval [s].
+        inputs: the inputs, in the order of the values.
+        outputs: the outputs after them.
+        values: values at the start.
+    """
+    node, about = ElementTree.SubElement, {"fmiVersion": "2.0", "modelName": name, "guid": token}
+    about |= {"generationTool": "rt_torchrl", "variableNamingConvention": "structured"}
+    model = ElementTree.Element("fmiModelDescription", about)
+    node(model, "CoSimulation", modelIdentifier=name, canHandleVariableCommunicationStepSize="true")
+    units = node(model, "UnitDefinitions")
+    for unit in dict.fromkeys(signal.unit for _, signal in (*inputs, *outputs)):
+        node(units, "Unit", name=unit)
+    node(model, "DefaultExperiment", startTime="0", stepSize=repr(dt))
+    variables, structure = node(model, "ModelVariables"), node(model, "ModelStructure")
+    listed = node(structure, "Outputs")
+    calculated = ElementTree.Element("InitialUnknowns")
+    for k, (kind, signal) in enumerate((*inputs, *outputs)):
+        is_output = k >= len(inputs)
+        about = {"name": f"{kind}.{signal.name}", "valueReference": str(k), "variability": "continuous"}
+        about["causality"] = "output" if is_output else "input"
+        if is_output:
+            # What a state starts with may be set; an action follows from the observation.
+            about["initial"] = "exact" if kind == "state" else "calculated"
+            for parent in [listed] if kind == "state" else [listed, calculated]:
+                node(parent, "Unknown", index=str(k + 1))
+        real = node(node(variables, "ScalarVariable", about), "Real", unit=signal.unit)
+        if not is_output or kind == "state":
+            real.set("start", repr(values[k]))
+    if len(calculated):
+        structure.append(calculated)
+    return ElementTree.tostring(model, encoding="UTF-8", xml_declaration=True)

@@ -1,79 +1,28 @@
-"""The policy as a PyTorch program: a file that torch alone can load."""
+"""A policy as a PyTorch program, which torch alone can load, or as an ONNX model for other run-time systems."""
 
+import contextlib
+import importlib
 import io
 import json
+import logging
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
+from rt_torchrl.export.agreement import detached, require_policy, sample_observations
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 INTERFACE = "interface.json"
-"""Name of the extra file of a program that describes its observations and actions."""
-
-
-def trace(policy: nn.Module, plant: Plant) -> ExportedProgram:
-    """The graph of a policy for any number of observations, ``(batch, n_o) -> (batch, n_a)``.
-
-    Args:
-        policy: policy from :func:`detached`.
-        plant: plant with the policy's observations.
-
-    Raises:
-        ValueError: if torch.export cannot trace the policy, or the policy draws random numbers.
-    """
-    name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
-    try:
-        program = torch.export.export(policy, (observations,), dynamic_shapes=({0: Dim("batch")},))
-        # This takes no operator apart, but removes those that do nothing in evaluation, such as dropout.
-        program = program.run_decompositions({})
-    except Exception as error:  # torch.export raises many kinds, of several modules
-        raise ValueError(
-            f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
-            "torch.where, and sizes such that any batch can be passed."
-        ) from error
-    for node in program.graph.nodes:
-        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
-            raise ValueError(f"{layer_of(node, name)} draws random numbers ({node.target}); export its mean instead.")
-    return program
-
-
-def layer_of(node: torch.fx.Node, policy: str) -> str:
-    """The module that a node of a graph comes from, in words."""
-    stack = list((node.meta.get("nn_module_stack") or {}).values())
-    path, kind = stack[-1] if stack else ("", policy)
-    kind = kind if isinstance(kind, str) else kind.__name__
-    return f"layer {path!r} ({kind.rpartition('.')[2]}) of policy {policy}" if path else f"policy {policy}"
-
-
-def interface(plant: Plant) -> dict[str, Any]:
-    """The description of a policy's observations and actions, as JSON can hold it; an absent bound is None.
-
-    An observation that is a scaled measurement is (measurement − offset)/scale, both in the unit ``measured_in``.
-    """
-
-    def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
-        return [{"name": s.name, "unit": s.unit, "low": finite(s.low), "high": finite(s.high)} for s in signals]
-
-    def finite(bound: float) -> float | None:
-        return bound if math.isfinite(bound) else None
-
-    scaled = [{"offset": m.offset, "scale": m.scale, "measured_in": m.unit} for m in plant.observed]
-    observed = scaled or [{} for _ in plant.observations]
-    return {
-        "plant": plant.name,
-        "control_interval_s": plant.dt,
-        "observation": [one | more for one, more in zip(described(plant.observations), observed, strict=True)],
-        "action": described(plant.actions),
-    }
+"""Name of the extra file of a program, and of the metadata of a model, that describes observations and actions."""
+ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 
 
 def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
@@ -91,15 +40,148 @@ def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         plant: plant with the policy's observations and actions.
 
     Returns:
-        Greatest difference from the policy, see :func:`require_agreement`.
+        Greatest difference from the policy, as a share of the range of an action.
 
     Raises:
         ValueError: if the policy does not fit the plant or cannot be traced, or the program does not agree with it.
     """
-    policy = detached(policy, plant)
-    file = io.BytesIO()
-    torch.export.save(trace(policy, plant), file, extra_files={INTERFACE: json.dumps(interface(plant), indent=2)})
+    policy, file = detached(policy, plant), io.BytesIO()
+    torch.export.save(_traced(policy, plant), file, extra_files={INTERFACE: json.dumps(interface(plant), indent=2)})
     loaded = torch.export.load(io.BytesIO(file.getvalue())).module()
-    error = require_agreement(policy, loaded, plant, what="the exported program")
+    difference = require_policy(policy, loaded, plant, "the exported program")
     write_atomically(Path(path), file.getvalue())
-    return error
+    return difference
+
+
+def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
+    """Write a policy as an ONNX model, input ``observation`` and output ``action``.
+
+    Their shapes are (batch, n_o) and (batch, n_a) for any batch, in double precision. The model's metadata hold
+    ``interface.json`` with names, units and ranges. The file contains the weights.
+
+    Args:
+        policy: any ``policy(observation) -> action`` in double precision.
+        path: file to write, such as ``policy.onnx``.
+        plant: plant with the policy's observations and actions.
+
+    Returns:
+        Greatest difference between the model in onnxruntime and the policy, as a share of the range of an action.
+
+    Raises:
+        ValueError: if a package of the extra ``export`` is missing, the policy does not fit the plant or has no ONNX
+            form, onnxruntime cannot run the model, or the model does not agree with the policy.
+    """
+    require_packages(ONNX_PACKAGES)
+    policy, name = detached(policy, plant), type(policy).__name__
+    program = _traced(policy, plant)
+    options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
+    try:
+        with _quiet():
+            exported = torch.onnx.export(
+                program, (), dynamo=True, verbose=False, dynamic_shapes=({0: "batch"},), **options
+            )
+    except Exception as error:  # the exporter raises several kinds
+        raise ValueError(
+            f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
+        ) from error
+    assert exported is not None  # the exporter of dynamo gives a program; only the older one gives none
+    model = exported.model_proto
+    entry = model.metadata_props.add()
+    entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
+    content = model.SerializeToString()
+    difference = require_policy(policy, onnx_runtime(content, name), plant, "the ONNX model")
+    write_atomically(Path(path), content)
+    return difference
+
+
+def _traced(policy: nn.Module, plant: Plant) -> ExportedProgram:
+    """The graph of a policy for any number of observations, ``(batch, n_o) -> (batch, n_a)``.
+
+    Raises:
+        ValueError: if torch.export cannot trace the policy, or the policy draws random numbers.
+    """
+    name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
+    try:
+        program = torch.export.export(policy, (observations,), dynamic_shapes=({0: Dim("batch")},))
+        # This takes no operator apart, but removes those that do nothing in evaluation, such as dropout.
+        program = program.run_decompositions({})
+    except Exception as error:  # torch.export raises many kinds, of several modules
+        raise ValueError(
+            f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
+            "torch.where, and sizes such that any batch can be passed."
+        ) from error
+    for node in program.graph.nodes:
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise ValueError(f"policy {name} draws random numbers ({node.target}); export its mean instead.")
+    return program
+
+
+def interface(plant: Plant) -> dict[str, Any]:
+    """The description of a policy's observations and actions, as JSON can hold it; an absent bound is None.
+
+    An observation that is a scaled measurement is (measurement − offset)/scale, both in the unit ``measured_in``.
+    """
+
+    def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+        return [
+            {"name": s.name, "unit": s.unit}
+            | {end: x if math.isfinite(x) else None for end, x in (("low", s.low), ("high", s.high))}
+            for s in signals
+        ]
+
+    scaled = [{"offset": m.offset, "scale": m.scale, "measured_in": m.unit} for m in plant.observed]
+    observed = scaled or [{} for _ in plant.observations]
+    return {
+        "plant": plant.name,
+        "control_interval_s": plant.dt,
+        "observation": [one | more for one, more in zip(described(plant.observations), observed, strict=True)],
+        "action": described(plant.actions),
+    }
+
+
+def require_packages(needed: Sequence[str]) -> None:
+    """Refuse to go on without packages of the extra ``export``.
+
+    Raises:
+        ValueError: if a package is not installed.
+    """
+    for package in needed:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ValueError(
+                f"ONNX needs the package {package}: install the extra, pip install 'rt_torchrl[export]'."
+            ) from error
+
+
+def onnx_runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
+    """A model as a function of a batch of observations.
+
+    Raises:
+        ValueError: if onnxruntime is not installed, or cannot run the model.
+    """
+    require_packages(["onnxruntime"])
+    import onnxruntime
+
+    try:
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    except Exception as error:  # the errors of onnxruntime have no common class
+        raise ValueError(
+            f"onnxruntime cannot run policy {policy} in double precision: {str(error).strip()}. Use the .pt2 program "
+            "or C instead."
+        ) from error
+    return lambda rows: torch.from_numpy(session.run(["action"], {"observation": rows.numpy()})[0])
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """A context without the exporter's notices, of a missing torchvision and of outdated functions in torch itself."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)

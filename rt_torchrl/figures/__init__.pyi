@@ -1,10 +1,18 @@
 """The figures of a training; ``__init__.py`` imports each at its first use, from the module named here."""
 
 from .comparison import flights, unseen
-from .policy import policy_contours
 from .snapshot import Snapshot
 from .style import pixels, save_figure, save_pixels
-from .training import actions, closure_weights, exogenous, figures_of, learning_curves, seconds, states
+from .training import (
+    actions,
+    closure_weights,
+    exogenous,
+    figures_of,
+    learning_curves,
+    policy_contours,
+    seconds,
+    states,
+)
 
 __all__ = [
     "Snapshot",

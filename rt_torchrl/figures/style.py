@@ -164,6 +164,13 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
         ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
 
 
+def fit_for_logarithms(ax: Axes, least_range: float) -> bool:
+    """Whether all finite values of the panel's lines are positive, and the greatest is this many times the least."""
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+    values = values[np.isfinite(values)]
+    return values.size > 0 and values.min() > 0.0 and values.max() >= least_range * values.min()
+
+
 def plain_numbers(ax: Axes) -> None:
     """Write 1, 2 and 5 of each decade on a logarithmic axis, as plain numbers."""
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

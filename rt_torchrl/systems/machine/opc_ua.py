@@ -58,7 +58,7 @@ class OpcUaLink:
         try:
             import asyncua.sync
         except ImportError as error:
-            raise ValueError("OPC UA needs asyncua: install the extra, pip install 'rt_torchrl[opcua]'.") from error
+            raise ValueError("OPC UA needs asyncua: install the extra, pip install 'rt_torchrl[machine]'.") from error
         require_number("timeout", timeout)
         if not timeout > 0.0:
             raise ValueError(f"timeout={timeout} s of the link must be positive.")

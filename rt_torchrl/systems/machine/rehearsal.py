@@ -301,7 +301,7 @@ class ServerProcess:
         except ImportError as error:
             raise ValueError(
                 f"a server of {protocol} needs its package ({error}): install the extra, "
-                f"pip install 'rt_torchrl[{protocol}]'."
+                "pip install 'rt_torchrl[machine]'."
             ) from error
         self._arguments, self._port = pickle.dumps((plant, tuple(safe), protocol, port, period, seed)), port
         self._context = multiprocessing.get_context("spawn")
@@ -371,7 +371,7 @@ def link_to(protocol: str, plant: Plant, port: int, *, period: float) -> Link:
             return OpcUaLink(client, own_nodes(read), own_nodes(written), timeout=timeout)
         from pymodbus.client import ModbusTcpClient
     except ImportError as error:
-        raise ValueError(f"{protocol} needs a package: install the extra, pip install 'rt_torchrl[{protocol}]'.") from (
+        raise ValueError(f"{protocol} needs a package: install the extra, pip install 'rt_torchrl[machine]'.") from (
             error
         )
     tcp = ModbusTcpClient(HOST, port=port, timeout=timeout, retries=0)

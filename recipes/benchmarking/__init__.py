@@ -1,1 +1,0 @@
-"""What ``recipes/benchmark.py`` times, and how."""
