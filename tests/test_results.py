@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 import struct
 import subprocess
 import sys
@@ -292,6 +293,8 @@ def test_the_csv_logger_has_the_curves_and_the_final_costs(stopped):
     (curve,) = (folder / "csv" / "scalars" / "cost").glob("real episode live policy.csv")
     rows = [(int(step), float(value)) for step, value in csv.reader(curve.open())]
     assert rows == [(k, pytest.approx(episode["real_cost"])) for k, episode in enumerate(metrics["episodes"])]
+    written = [path.name for path in (folder / "csv").rglob("*.csv")]
+    assert "alarm the twin is wrong where it matters.csv" in written and not re.search(r"[:<>|?*\"]", "".join(written))
     (final,) = (folder / "csv" / "scalars" / "final").glob("J_a live.csv")
     live = metrics["summary"]["unseen"][f"J_a_{metrics['summary']['live']}"]["mean"]
     assert float(final.read_text().split(",")[1]) == pytest.approx(live)

@@ -65,8 +65,8 @@ GROUPS = {
     **{kind: kind for kind in ("faults/", "violations/", "excess/", "multiplier/")},
 }
 """Tags of entries of which an episode has several, by what they begin with."""
-REFUSED = re.compile(r"[^\w\-. /:]")
-"""What loggers beside TensorBoard take in no name: MLflow refuses brackets and commas."""
+REFUSED = re.compile(r"[^\w\-. /]")
+"""What only TensorBoard gets in a name: MLflow refuses brackets and commas, names of files on Windows colons."""
 OVER_THE_FIRST = ("real_cost", "J_p", "J_a_model_based", "J_a_model_free")
 """Costs that are shown over that of the first episode, too, as the paper shows them."""
 COSTS = [
