@@ -8,8 +8,6 @@ import threading
 import time
 from typing import Any
 
-from rt_torchrl.systems.operation.process import end_process
-
 SIZE = 65536
 START = 30.0
 """Longest time until the relay listens [s]."""
@@ -62,7 +60,10 @@ class Relay:
     def close(self) -> None:
         """Close all connections, and listen no more."""
         self._orders.close()  # which ends the process
-        end_process(self._process, END)
+        self._process.join(END)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
 
 
 def run_relay(target: int, port: int, orders: Any) -> None:

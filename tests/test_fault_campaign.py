@@ -461,7 +461,7 @@ def require_faults_survived(name, kind, *, asynchronous=False):
     assert [name for name in reports[0].keys() if name.startswith("faults/")] == []  # noqa: SIM118
     kinds = {key.removeprefix("faults/") for key in reports[1].keys() if key.startswith("faults/")}  # noqa: SIM118
     assert EXPECTED.get(kind, set()) <= kinds
-    stored = found.learner.memory.transitions()
+    stored = found.learner.memory.buffer[:]
     kept = len(stored) - 2 * N
     if kind in OF_SYSTEMS:
         assert kept == 30 + (kind == "ends_early")

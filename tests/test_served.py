@@ -1,5 +1,6 @@
 """A plant behind OPC UA and Modbus, lost connections, and the recipes and the page that connect to one."""
 
+import dataclasses
 import json
 import math
 import socket
@@ -377,10 +378,10 @@ PACE = 5.0  # a period of 0.1 s, for a machine that does other things too
 def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
     module = recipe("served_turbine")
     usual = module.Config().defaults()
-    config = module.dataclasses.replace(
+    config = dataclasses.replace(
         usual, quick=True, horizon=60.0, pace=PACE, port=free_port(), threads=1, log_dir=tmp_path, figures=False
     )
-    module.main(module.dataclasses.replace(config, untrained=0))
+    module.main(dataclasses.replace(config, untrained=0))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     versions = [record["version"] for record in metrics["episodes"]]
     assert len(versions) == 3 and versions == sorted(versions) and versions[-1] >= 1.0
