@@ -4,8 +4,6 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from small_runs import small_run
-from test_classical import PD
-from test_real_system import connected
 from torch import nn
 
 from rt_torchrl import SaturatedMLP
@@ -14,7 +12,7 @@ from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.checks import engine_gap
 from rt_torchrl.evaluation.limits import exact_optimum
-from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.trajectories.engines.interval import Autograd
@@ -42,12 +40,10 @@ class OnlyReal(RealController):
         raise AssertionError
 
 
-def test_a_controller_of_another_kind_of_episodes_is_refused():
+def test_a_controller_that_flies_the_real_system_alone_is_not_simulated():
     plant = LinearQuadratic()
     with pytest.raises(ValueError, match="law=OnlyReal can only be flown on a real system; give a ClassicalController"):
         UnseenEpisodes(plant, 2).fly_baseline(OnlyReal(plant))
-    with pytest.raises(ValueError, match="law=PD is flown on the plant.*give a RealController"):
-        RealEpisodes(connected(plant), 2).fly_baseline(PD(plant))
 
 
 LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582
