@@ -122,13 +122,13 @@ class LoadedRun:
         """
         if on not in ("real", "twin"):
             raise ValueError(f"on={on!r} must be real or twin.")
+        if not isinstance(policy, nn.Module | StateFeedback):
+            raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
         if on == "real" and self.metrics["summary"].get("unseen", {}).get("judged_on") == "twin":
             raise ValueError(
                 "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
                 "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
             )
-        if not isinstance(policy, nn.Module | StateFeedback):
-            raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
         believed = self.twin.believed
         plant, closure = (self.plant, self._true_closure()) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
