@@ -23,7 +23,6 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "sphinx_copybutton",
-    "sphinx_design",
 ]
 exclude_patterns = ["_build", "first_steps.ipynb"]
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]

@@ -108,7 +108,7 @@ class Suspicion(NamedTuple):
 class Wiring(NamedTuple):
     """What the check has found.
 
-    Attributes:
+    Args:
         plant: plant that gives the states.
         present: the wiring as it is; ``error`` is the RMS error of one-step predictions, in the units of the states.
         moved: RMS movement of each state in an interval, in its unit.
