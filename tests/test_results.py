@@ -382,7 +382,7 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     live = metrics["summary"]["live"]
     cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
 
-    def said(better, controller, planner=None, **summary):
+    def said(better, controller, planner="multi_start", **summary):
         unseen = metrics["summary"]["unseen"] | {"baselines": {"PI": {"J_a": {"mean": controller}}}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
