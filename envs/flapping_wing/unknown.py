@@ -6,7 +6,13 @@ Parameters without a source are engineering guesses.
 from collections.abc import Mapping
 from functools import partial
 
-from rt_torchrl.plants.actuators import LaggedActuator, ResonantActuator, ScaledActuator
+from rt_torchrl.plants.actuators import (
+    LaggedActuator,
+    PlayActuator,
+    RateLimitedActuator,
+    ResonantActuator,
+    ScaledActuator,
+)
 from rt_torchrl.plants.extension import System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import UnreadInput
@@ -87,6 +93,9 @@ SYSTEMS: Mapping[str, System] = {
     "delay": {"link": partial(late, delay=0.2)},
     "sag": {"supply": sagging},
     "gust": {"wind": gusty},
+    "plane_rate": {"stroke plane": partial(RateLimitedActuator, action=PLANE, size=60.0)},
+    "amplitude_play": {"supply": partial(PlayActuator, action=AMPLITUDE, size=3.0)},
+    "plane_play": {"stroke plane": partial(PlayActuator, action=PLANE, size=4.0)},
     "lift_lag": {"wings": lifting_late},
     "all_1": {
         "wind": gusty,

@@ -11,7 +11,14 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
+from rt_torchrl.plants.actuators import (
+    DelayedActuator,
+    LaggedActuator,
+    PlayActuator,
+    RateLimitedActuator,
+    ResonantActuator,
+    StickingActuator,
+)
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
 from rt_torchrl.plants.plant import Plant
@@ -133,6 +140,72 @@ class MisreadWind(Extension):
         return read.clamp(min=self.inputs[0].low)
 
 
+class SwayingTower(Extension):
+    r"""A turbine whose tower sways fore and aft, so that rotor and anemometer meet the wind u − v.
+
+    .. math:: m\dot v = \tfrac12\rho A\,(u - v)^2 C_T(\beta) - 2\zeta m\Omega v - m\Omega^2x, \qquad \dot x = v
+
+    Mass m = 437 t (rotor and nacelle 350 t, a quarter of the tower), Ω = 2.04 rad/s and ζ = 1 % of the first fore-aft
+    mode: NREL/TP-500-38060. Thrust :math:`C_T = 0.81 e^{-\beta/9\,\mathrm{deg}}`: a fit to the thrust curve there.
+
+    Args:
+        base: the turbine, perhaps extended.
+        softness: share by which Ω is lower than that of the reference tower.
+    """
+
+    advance = Plant.advance
+    mass, natural_frequency, damping = 437e3, 2.04, 0.01
+    thrust_coefficient, thrust_pitch = 0.81, 9.0
+
+    def __init__(self, base: Plant, softness: float = 0.0):
+        super().__init__(
+            base,
+            [Signal(symbol="x", name="tower_top", unit="m"), Signal(symbol="v", name="tower_top_speed", unit="m/s")],
+        )
+        self.frequency = self.natural_frequency * (1.0 - softness)
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        turbine: Any = self.base.innermost
+        (base, hidden), met = self.split(state), exogenous[..., 0] - state[..., -1]
+        x, v = hidden.unbind(-1)
+        field = self.base.vector_field(t, base, action, replaced(exogenous, 0, met), closure)
+        area = math.pi * turbine.radius**2
+        coefficient = self.thrust_coefficient * torch.exp(-action[..., 1] / self.thrust_pitch)
+        thrust = 0.5 * turbine.air_density * area * met.square() * coefficient / self.mass
+        spring = self.frequency**2 * x + 2.0 * self.damping * self.frequency * v
+        return torch.cat([field, torch.stack([v, thrust - spring], -1)], -1)
+
+    def rest(self, base: State) -> Hidden:
+        """The tower stands as the wind bends it on average, without motion."""
+        turbine: Any = self.base.innermost
+        coefficient = self.thrust_coefficient * torch.exp(-base[..., 5] / self.thrust_pitch)
+        thrust = 0.5 * turbine.air_density * math.pi * turbine.radius**2 * base[..., 2].square() * coefficient
+        x = thrust / (self.mass * self.frequency**2)
+        return torch.stack([x, torch.zeros_like(x)], -1)
+
+
+class LossySpeed(Extension):
+    r"""A turbine whose drive train takes a share of the rated torque that grows with the square of the speed.
+
+    .. math:: J\dot\omega_r = \ldots - \kappa\,N_g\tau_\mathrm{rated}\,(\omega_r/\omega_\mathrm{rated})^2
+
+    Churning of oil and windage of the generator; share κ: engineering guess, gearboxes lose 3 to 6 %.
+    """
+
+    advance = Plant.advance
+
+    def __init__(self, base: Plant, share: float):
+        super().__init__(base, [])
+        self.share = share
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        turbine: Any = self.base.innermost
+        field = self.base.vector_field(t, state, action, exogenous, closure)
+        rated = turbine.rated_rotor_speed
+        loss = self.share * turbine.gear_ratio * turbine.actions[0].high * (state[..., 0] / rated) ** 2
+        return replaced(field, 0, field[..., 0] - loss / turbine.inertia)
+
+
 def suspects(plant: Plant) -> Mapping[str, Plant]:
     """What a twin of the turbine suspects: dead times of one to three intervals and a lag of the pitch, and inflow."""
 
@@ -169,7 +242,7 @@ def slow_pitch(plant: Plant) -> Plant:
     return DelayedActuator(ResonantActuator(plant, "blade_pitch", 1.5, 0.7), "blade_pitch", 1.0)
 
 
-PARTS = ("inflow", "shaft", "anemometer", "pitch drive")
+PARTS = ("inflow", "shaft", "tower", "anemometer", "pitch drive")
 """Parts of the turbine, in the order in which they are changed: what is next to the rotor comes first."""
 SYSTEMS: dict[str, System] = {
     # Engineering guesses; anemometers on a nacelle stand in the wake of the blades.
@@ -180,6 +253,15 @@ SYSTEMS: dict[str, System] = {
     # D/u at rated wind speed, 126 m/11.4 m/s = 11 s, rounded; D and u of NREL/TP-500-38060.
     "inflow": {"inflow": partial(LaggedInflow, time_constant=10.0, of="torque")},
     "pitch": {"pitch drive": slow_pitch},
+    # Pitch drives of 5-MW turbines reach 8 deg/s (NREL/TP-500-38060); 2 and 1 deg/s: engineering guesses, worn drives.
+    "pitch_rate_2": {"pitch drive": partial(RateLimitedActuator, action="blade_pitch", size=2.0)},
+    "pitch_rate_1": {"pitch drive": partial(RateLimitedActuator, action="blade_pitch", size=1.0)},
+    # Play and stiction of worn gears and bearings; engineering guesses.
+    "pitch_play": {"pitch drive": partial(PlayActuator, action="blade_pitch", size=2.5)},
+    "pitch_sticks": {"pitch drive": partial(StickingActuator, action="blade_pitch", size=2.0)},
+    "tower": {"tower": SwayingTower},
+    "tower_soft": {"tower": partial(SwayingTower, softness=0.4)},
+    "speed_loss": {"shaft": partial(LossySpeed, share=0.1)},
 }
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
 SYSTEMS["all"] = {**SYSTEMS["inflow"], **SYSTEMS["torque_loss"], **SYSTEMS["anemometer_low"], **SYSTEMS["pitch"]}

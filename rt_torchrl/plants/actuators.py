@@ -8,7 +8,7 @@ from torch import nn
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.extension import Extension, replaced, settled
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import Action, Hidden, State
+from rt_torchrl.plants.shapes import Action, Cost, Hidden, State
 from rt_torchrl.plants.signal import Signal, place_of
 
 LONGEST_DELAY = 64
@@ -197,3 +197,89 @@ class ScaledActuator(Extension):
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, self.gain * applied[..., self.place])
+
+
+class PositionedActuator(Extension):
+    """A plant with an actuator whose position x is where its last action has left it; a subclass says how it moves.
+
+    Args:
+        base: the plant.
+        action: name of the action.
+        size: what the motion is limited by, in the unit that :attr:`unit` says.
+
+    Raises:
+        ValueError: if there is no such action, or the size is not positive and finite.
+    """
+
+    unit = ""
+    """Unit of the size, after that of the action."""
+
+    def __init__(self, base: Plant, action: str, size: float):
+        self.place, self.size = place_of("action", action, base.actions, base.name), size
+        signal = base.actions[self.place]
+        if not 0.0 < size < math.inf:
+            raise ValueError(f"size={size} {signal.unit}{self.unit} of {action} must be positive and finite.")
+        super().__init__(base, [Signal(symbol=signal.symbol + "'", name=f"position_of_{action}", unit=signal.unit)])
+
+    def moved(self, x: Cost, asked: Cost) -> Cost:
+        """The position at the end of an interval in which an action is asked for."""
+        raise NotImplementedError
+
+    def mean(self, x: Cost, end: Cost, asked: Cost) -> Cost:
+        """The mean position over the interval; by default that of its end, where the motion takes no time."""
+        return end
+
+    def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
+        x, asked = hidden[..., 0], applied[..., self.place]
+        end = self.moved(x, asked)
+        return replaced(applied, self.place, self.mean(x, end, asked)), end.unsqueeze(-1)
+
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        """The mean rates over an interval: what sticks or has play follows no differential equation."""
+        return (self.respond(hidden, applied, closure)[1] - hidden) / self.dt
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, self.moved(hidden[..., 0], applied[..., self.place]))
+
+    def rest(self, base: State) -> Hidden:
+        return settled(self.base, self.place, base).unsqueeze(-1)
+
+
+class RateLimitedActuator(PositionedActuator):
+    r"""A plant with an actuator that reaches what it is asked for with no more than a rate r, :math:`|\dot x| \le r`.
+
+    In an interval it moves for the time :math:`\min(\Delta t, |a - x|/r)` and rests then; its mean acts on the plant.
+    ``size`` is r.
+    """
+
+    unit = "/s"
+
+    def moved(self, x: Cost, asked: Cost) -> Cost:
+        return x + (asked - x).clamp(-self.size * self.dt, self.size * self.dt)
+
+    def mean(self, x: Cost, end: Cost, asked: Cost) -> Cost:
+        moving = ((asked - x).abs() / (self.size * self.dt)).clamp(max=1.0)
+        return end - 0.5 * moving * (end - x)
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, hidden[..., 0])
+
+
+class PlayActuator(PositionedActuator):
+    r"""A plant with play (backlash) of ± b between an actuator and what it moves, :math:`|a - x| \le b`.
+
+    The position follows only where the actuator pushes it, :math:`x' = \max(a - b, \min(a + b, x))`. ``size`` is b.
+    """
+
+    def moved(self, x: Cost, asked: Cost) -> Cost:
+        return torch.maximum(asked - self.size, torch.minimum(asked + self.size, x))
+
+
+class StickingActuator(PositionedActuator):
+    """A plant with an actuator that sticks until it is asked for more than s away from its position, and then slips.
+
+    It slips to where it is asked for. ``size`` is s.
+    """
+
+    def moved(self, x: Cost, asked: Cost) -> Cost:
+        return torch.where((asked - x).abs() > self.size, asked, x)
