@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.plants.actuators import LaggedActuator, PlayActuator
+from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.extension import Extension, System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import BiasedSensor

@@ -1,59 +1,58 @@
 r"""What a policy costs on the real system: a belief over policies, learned from the real episodes.
 
-The twin flies each real episode again with the same weights from the same state under the same inputs, so that luck
-cancels. What is left is the paired difference :math:`d_i = \log J_i - \log\hat J_i`. A Gaussian process of d over
-policies, whose distance is that of their actions, says how wrong the twin is about a policy that has not flown,
+The twin flies each of the latest real episodes again under the policy, alone and with what it did not explain of the
+episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin says,
+the better the nearer the policy is to what was flown. Its error has the variance
 
-.. math::
-    k(\pi, \pi') = \sigma^2\Big(c + (1 - c)\exp\big(-\tfrac12\|a_\pi - a_{\pi'}\|^2/\ell^2\big)\Big)
+.. math:: s_i^2 = \sigma^2 + v\,\|\pi - a_i\|^2
 
-Here a_π are the actions of a policy in some observations of the real system, in shares of half their ranges, and the
-norm is the root mean square. The data choose σ: a twin that has been right keeps the word. The cost that is expected on
-the real system is :math:`\hat J e^{m + s^2/2}`, with mean m and variance s² of d; plans, updates, clones and the
-referee of step 6 compare this one.
+with the mean squared difference of the actions in the observations of the episode, in shares of half their ranges. The
+corrections together have mean and variance
+
+.. math:: m = s^2\sum_i c_i/s_i^2, \qquad s^{-2} = \sum_i s_i^{-2}
+
+and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans,
+updates, clones and the referee of step 6 take this one. How well the episodes predict each other chooses v: a twin that
+has been right keeps the word.
 """
 
 import copy
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import minimize_scalar
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten
 
-from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import findings, same_architecture
+from rt_torchrl.trajectories.anchored import AnchoredReplays, AnchoredTwin
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
-
-if TYPE_CHECKING:
-    from sklearn.gaussian_process import GaussianProcessRegressor
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 HISTORY = 20
-"""Number of latest real episodes that the belief is learned from."""
-OBSERVATIONS = 64
-"""Number of observations in which policies are compared."""
-COMMON = 0.04
-"""Share c of the error's variance that all policies have in common."""
-LENGTH = 0.1
-"""Distance ℓ of neighbours, as an RMS difference of their actions in shares of half the ranges."""
-AMPLITUDE = (0.02, 2.0)
-"""Least and greatest σ. The least one costs a policy that never flew 0.02 %: on a right twin small gains count."""
+"""Number of latest real episodes that are kept."""
+ANCHORS = 8
+"""Number of latest whole episodes whose anchored replays correct the twin."""
 NOISE = 0.05
-"""Standard deviation of d for one episode: what the replay does not repeat."""
+"""Standard deviation σ of the correction by an episode that was flown with the policy: what differs between inputs."""
+GROWTH = 10.0
+"""The variance v that is expected beforehand, as a multiple of the mean square of the corrections that were met."""
+PRIOR = 2.0
+"""Number of episodes that this expectation counts for."""
+LEAST = 1e-6
+"""Least v. A policy that never flew costs nothing more on a right twin: small gains count there."""
 EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration, as a share of half the ranges."""
-CHEAPER, DEARER = -1.0, 5.0
-"""Least and greatest d that count. A twin that says more than e times the real cost blows up where the real system does
-not, and need not do so with the neighbours of a policy. Beyond e⁵ it does not matter how wrong a prediction is."""
+DEARER = 5.0
+"""Greatest size of d that counts. Beyond e⁵ it does not matter how wrong a prediction is."""
 QUIET = 0.02
 """Exploration above which the cost of an episode says little about its policy."""
 ALARM = 0.15
@@ -82,6 +81,13 @@ class Judged(NamedTuple):
     price: float
 
 
+class Anchors(NamedTuple):
+    """The anchored replays of the latest real episodes, and the growth v of the variance of their corrections."""
+
+    replays: AnchoredReplays
+    growth: float
+
+
 class Belief:
     """The belief about the cost of policies on the real system; the module says how.
 
@@ -96,7 +102,10 @@ class Belief:
         self._policies = policies
         self.flown: list[Flown] = []
         self._differences: tuple[Any, list[float]] | None = None
-        self._process: GaussianProcessRegressor | None = None
+        self._anchored: tuple[Any, Anchors | None] | None = None
+        self._twins: dict[DigitalTwin, AnchoredTwin] = {}
+        if corrects:
+            virtual.twin.correct(self.correction)
 
     def append(
         self,
@@ -120,7 +129,7 @@ class Belief:
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
-        self._differences = None
+        self._differences = self._anchored = None
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it."""
@@ -137,7 +146,6 @@ class Belief:
         state = self.virtual.twin.state_dict()
         if self._differences is None or not equal(state, self._differences[0]):
             self._differences = copy.deepcopy(state), [self._difference(one) for one in self.flown]
-            self._process = None
         return self._differences[1]
 
     def _difference(self, flown: Flown) -> float:
@@ -191,62 +199,88 @@ class Belief:
         cost, price = self.virtual.judge(policy, episodes)
         return Judged(self.expected(policy, cost), price)
 
+    @torch.no_grad()
     def expected(self, policy: nn.Module, cost: float) -> float:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
         if not self.corrects or not 0.0 < cost < math.inf:
             return cost
-        self.differences()
-        if self._process is None:
-            self._process = self._learned()
-        if self._process is None:
-            return cost
-        mean, deviation = self._process.predict(self._actions(policy)[None], return_std=True)
-        return cost * math.exp(mean.item() + 0.5 * deviation.item() ** 2)
+        try:
+            return cost * math.exp(min(self.correction(policy).item(), DEARER))
+        except DivergenceError:
+            return math.inf
 
-    def _learned(self) -> "GaussianProcessRegressor | None":
-        """The process given all episodes; None without any."""
-        # Here, because it takes a second to load.
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+    def correction(self, policy: nn.Module) -> Float[Tensor, ""]:
+        """The log m + s²/2 of the expected cost over the twin's, differentiable by the policy's weights.
 
-        pairs = [(d, one) for d, one in zip(self.differences(), self.flown, strict=True) if not math.isnan(d)]
-        if not pairs:
-            return None
-        values = np.clip([d for d, _ in pairs], CHEAPER, DEARER)
-        noise = np.array([NOISE**2 + (EXPLORED * one.exploration) ** 2 for _, one in pairs])
-        near = ConstantKernel(1.0 - COMMON, "fixed") * RBF(LENGTH, "fixed")
-        least, greatest = (sigma**2 for sigma in AMPLITUDE)
-        kernel = ConstantKernel(least, (least, greatest)) * (ConstantKernel(COMMON, "fixed") + near)
-        process = GaussianProcessRegressor(kernel, alpha=noise)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a twin that is right has the least σ
-            return process.fit(np.stack([self._actions(self.policy_of(one)) for _, one in pairs]), values)
+        It is zero before the first whole episode, and for state feedback, which is no function of an observation.
+
+        Raises:
+            DivergenceError: if a replay diverges under the policy.
+        """
+        anchors = self._anchors()
+        if anchors is None or isinstance(policy, StateFeedback):
+            return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
+        precisions = 1.0 / (NOISE**2 + anchors.growth * anchors.replays.distances(policy))
+        mean = (precisions * anchors.replays.corrections(policy)).sum() / precisions.sum()
+        return mean + 0.5 / precisions.sum()
+
+    def _anchors(self) -> "Anchors | None":
+        """The latest whole episodes on the present twin; None without any."""
+        twin = self.virtual.twin
+        state = twin.state_dict()
+        if self._anchored is None or not equal(state, self._anchored[0]):
+            self._anchored = copy.deepcopy(state), self._anchors_on(twin.believed)
+        return self._anchored[1]
 
     @torch.no_grad()
-    def _actions(self, policy: nn.Module) -> Float[np.ndarray, " m"]:
-        """A policy's actions in some observations of the last real episode, whose distance is their RMS difference."""
-        plant, record = self.virtual.twin.plant, self.flown[-1].trajectory
-        n = len(record.actions)
-        at = torch.linspace(0, n - 1, min(n, OBSERVATIONS), device=record.states.device).round().long()
-        width = len(at) * len(plant.actions)
-        if isinstance(policy, StateFeedback):  # no function of an observation, and no neighbour of a policy
-            return np.full(width, 10.0 / math.sqrt(width))
-        observations = plant.observe(record.start + at.double() * plant.dt, record.states[at], record.exogenous[at])
-        low, high = bounds(plant.actions, device=at.device)
-        shares = 2.0 * policy(observations) / (high - low)
-        return shares.flatten().cpu().numpy() / math.sqrt(width)
+    def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
+        n = twin.plant.n_steps
+        repeated = [(flown, self.virtual.repeated(flown.trajectory).exogenous) for flown in self.flown]
+        whole = [(flown, inputs) for flown, inputs in repeated if inputs.shape[1] == n][-ANCHORS:]
+        if not whole:
+            return None
+        if twin not in self._twins:
+            self._twins[twin] = AnchoredTwin(twin)
+        records, inputs = [flown.trajectory for flown, _ in whole], torch.cat([inputs for _, inputs in whole])
+        replays = AnchoredReplays(self._twins[twin], records, inputs)
+        return Anchors(replays, self._growth(replays, [flown for flown, _ in whole]))
 
-    @property
-    def contradicted(self) -> bool:
-        """Whether a real episode cost more than the twin says, beyond chance and what exploration explains."""
-        pairs = zip(self.differences(), self.flown, strict=True)
-        return any(d - 2.0 * EXPLORED * one.exploration > ALARM for d, one in pairs)
+    def _growth(self, replays: AnchoredReplays, flown: Sequence[Flown]) -> float:
+        """The most likely growth v of the variance of corrections with the distance of a policy."""
+        met, pairs = list[float](), list[tuple[float, float]]()
+        for k, episode in enumerate(flown):
+            policy = self.policy_of(episode)
+            if isinstance(policy, StateFeedback):
+                continue
+            distances = replays.distances(policy).tolist()
+            try:
+                corrections = replays.corrections(policy).tolist()
+            except DivergenceError:
+                corrections = [DEARER] * len(flown)
+            met.append(corrections[k])
+            pairs += [
+                (corrections[k] - other, far)
+                for i, (other, far) in enumerate(zip(corrections, distances, strict=True))
+                if i != k
+            ]
+        if not met:
+            return LEAST
+        expected = max(LEAST, GROWTH * sum(c * c for c in met) / len(met))
+        share = 1.0 / max(1, len(flown) - 1)
+
+        def unlikely(log_growth: float) -> float:
+            v = math.exp(log_growth)
+            variances = [(min(error * error, DEARER), 2.0 * NOISE**2 + v * far) for error, far in pairs]
+            misfit = sum(math.log(variance) + square / variance for square, variance in variances)
+            return PRIOR * (log_growth + expected / v) + share * misfit
+
+        around = math.log(expected)
+        return math.exp(minimize_scalar(unlikely, bounds=(around - 5.0, around + 5.0), method="bounded").x)
 
     def best_flown(self, like: nn.Module, episodes: Scenario) -> tuple[dict[str, Tensor], Judged] | None:
         """The weights that are expected to cost least of all that have flown in an architecture; None if none has."""
         different: list[Flown] = []
-        for one in self.flown:
+        for one in self.flown[-ANCHORS:]:
             if not any(equal(one.weights, other.weights) for other in different):
                 different.append(one)
         flown = [policy for policy in map(self.policy_of, different) if same_architecture(policy, like)]
@@ -273,7 +307,7 @@ class Belief:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
-        self._differences = self._process = None
+        self._differences = self._anchored = None
 
 
 def difference(real: float, predicted: float) -> float:

@@ -283,21 +283,19 @@ class MultiStart:
             self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
-        flown = self.belief.best_flown(policy, judged_on) if several or self._refuted else None
+        flown = self.belief.best_flown(policy, judged_on) if self.count and self.belief.corrects else None
+        others: Iterable[tuple[int, Weights]] = ()
         if several:
             others = self._others(episode, planned_on, flown)
-            new = ((number, weights) for number, weights in others if not equal(weights, present))
-            best = self._best(best, new, planned_on, judged_on)
-        if flown is not None and self._refuted and flown[1] < best.cost:
+        elif flown is not None and flown[1] < stays:
+            others = [(3, flown[0])]
+        new = ((number, weights) for number, weights in others if not equal(weights, present))
+        best = self._best(best, new, planned_on, judged_on)
+        if flown is not None and flown[1] < best.cost:
             best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
             self.planner.restart()
         return merged(best.report, self._raised(planned_on))
-
-    @property
-    def _refuted(self) -> bool:
-        """Whether a policy that has flown may be better than all that the twin plans."""
-        return self.count > 0 and self.belief.corrects and self.belief.contradicted
 
     def _best(
         self, best: Plan, others: Iterable[tuple[int, Weights]], planned_on: Scenario, judged_on: Scenario

@@ -10,6 +10,7 @@ cost grows with the number of weights, unlike that of an adjoint: they are for u
 """
 
 import copy
+from collections.abc import Callable
 from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -55,6 +56,7 @@ class DigitalTwin:
         self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure)
         self._planned: list[_Planned] = []
+        self._correction: Callable[[nn.Module], Tensor] | None = None
 
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
@@ -101,6 +103,15 @@ class DigitalTwin:
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))
         return self._planning(policy).costs(initial_state, exogenous)
+
+    def correct(self, correction: Callable[[nn.Module], Tensor]) -> None:
+        """Take what real episodes say of costs: a function of a policy that gives the log of their ratio to its own."""
+        self._correction = correction
+
+    def expected_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
+        """What is expected on the real system of :meth:`episode_costs`; these, where nothing corrects them."""
+        costs = self.episode_costs(policy, initial_state, exogenous)
+        return costs if self._correction is None else costs * self._correction(policy).exp()
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""

@@ -1,0 +1,160 @@
+r"""Anchored replays: virtual episodes that begin as real ones were, with what the twin did not explain added to them.
+
+A real episode with the actions a and the inputs z leaves the increments
+
+.. math:: e_k = s_{k+1} - \Phi(s_k, a_k, z_k; w_p)
+
+to the twin. Added to a virtual episode from the same start under the same inputs,
+
+.. math:: \tilde s_{k+1} = \Phi(\tilde s_k, \pi(\tilde s_k), z_k; w_p) + e_k
+
+they make it the real episode if the policy takes the actions that were flown, whatever the twin lacks. Near them the
+replay says to first order how the real system answers, by the twin's Jacobians along the *real* states.
+
+Sources: iterative learning control (Bristow, Tharayil, Alleyne, IEEE Control Systems 26 (2006) 96); gradients of a
+model along real trajectories (Abbeel, Quigley, Ng, ICML 2006).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.extension import Extension
+from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.shapes import Action, Costs, Hidden, Input, Inputs, Starts, State, Time
+from rt_torchrl.plants.signal import Signal, bounds, differences
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+OBSERVATIONS = 256
+"""Greatest number of observations of an episode in which actions are compared."""
+
+
+class _Driven(Extension):
+    """A plant with further inputs, after its own, which only the map of an interval reads.
+
+    Args:
+        base: the plant of a twin.
+        symbol: symbol of the further inputs, one for each state that sensors read.
+    """
+
+    own_scheme = True
+    """What is added to an interval as a whole has no vector field."""
+
+    def __init__(self, base: Plant, symbol: str):
+        super().__init__(base, [])
+        self.count = len(base.inputs)
+        added = [Signal(symbol=symbol, name=f"{symbol}_{signal.name}", unit=signal.unit) for signal in base.readings]
+        self.inputs = (*base.inputs, *added)
+
+    def divided(self, exogenous: Input) -> tuple[Input, Float[Tensor, "*batch n_r"]]:
+        """The inputs of the plant, and the further ones."""
+        return exogenous[..., : self.count], exogenous[..., self.count :]
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        return self.base.vector_field(t, state, action, self.divided(exogenous)[0], closure)
+
+    def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
+        if "exogenous" in given:
+            given["exogenous"] = self.divided(given["exogenous"])[0]
+        return super().ask(part, method, given)
+
+
+class Anchored(_Driven):
+    """A plant whose interval ends the increments e further; its inputs are those of the plant, and e."""
+
+    def __init__(self, base: Plant):
+        super().__init__(base, "increment")
+
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
+        met, increments = self.divided(exogenous)
+        end = self.base.advance(t, state, applied, met, closure)
+        n = increments.shape[-1]
+        return torch.cat([end[..., :n] + increments, end[..., n:]], -1)
+
+
+class Followed(_Driven):
+    """A plant whose intervals begin with the states that sensors have read; hidden states follow from them."""
+
+    def __init__(self, base: Plant):
+        super().__init__(base, "measured")
+
+    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
+        met, measured = self.divided(exogenous)
+        began = torch.cat([measured, self.hidden(state)], -1)
+        return self.base.step(t, began, command, met, closure)
+
+    def hidden(self, state: State) -> Hidden:
+        """The states that no sensor reads."""
+        return state[..., len(self.base.readings) :]
+
+
+class AnchoredTwin:
+    """A twin beside itself with increments, and with the states that sensors have read.
+
+    Args:
+        twin: the twin; of an ensemble the believed one.
+    """
+
+    def __init__(self, twin: DigitalTwin):
+        self.twin, self.anchored, self.followed = twin, twin.of(Anchored(twin.plant)), twin.of(Followed(twin.plant))
+
+
+class AnchoredReplays:
+    """The anchored replays of real episodes of equal length on a twin with its present closure.
+
+    Args:
+        twins: the twin.
+        records: what was flown, with the states that sensors read.
+        inputs: exogenous inputs of each episode to its horizon; longer than a record that ended early.
+    """
+
+    def __init__(self, twins: AnchoredTwin, records: Sequence[Trajectory], inputs: Inputs):
+        self.twins, self.twin, plant = twins, twins.twin, twins.twin.plant
+        self.start: Starts = plant.at_rest(torch.stack([record.states[0] for record in records]))
+        increments = [self.increments(record) for record in records]
+        longest = inputs.shape[1]
+        padded = [torch.cat([e, e.new_zeros(longest - len(e), e.shape[-1])]) for e in increments]
+        self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(padded)], -1)
+        self._seen = [self._observed(record) for record in records]
+        self.low, self.high = bounds(plant.actions, device=inputs.device)
+
+    @torch.no_grad()
+    def increments(self, record: Trajectory) -> Float[Tensor, "n n_r"]:
+        """What the twin does not explain of the states that sensors read at the end of each interval."""
+        plant, n = self.twin.plant, len(record.actions)
+        read, driven = record.states, torch.cat([record.exogenous, record.states[:-1]], -1)
+        flown = self.twins.followed.replay(
+            plant.at_rest(read[:1]), driven[None], record.actions[None], start=record.start
+        )
+        return differences(plant.readings, read[1:], flown.states[0, 1 : n + 1, : read.shape[-1]])
+
+    def _observed(self, record: Trajectory) -> tuple[State, Tensor, Action]:
+        """Some states of an episode, what policies observe there, and the actions that were flown there."""
+        plant, n = self.twin.plant, len(record.actions)
+        at = torch.linspace(0, n - 1, min(n, OBSERVATIONS), device=record.states.device).round().long()
+        states = record.states[at]
+        t = record.start + at.double() * plant.dt
+        hidden = plant.at_rest(states)
+        return hidden, plant.observe(t, hidden, record.exogenous[at]), record.actions[at]
+
+    def corrections(self, policy: nn.Module) -> Costs:
+        r"""The log :math:`c_i = \log\tilde J_i - \log\hat J_i` of what each anchored replay costs over the twin's own.
+
+        Raises:
+            DivergenceError: if a replay diverges under the policy.
+        """
+        anchored = self.twins.anchored.episode_costs(policy, self.start, self.anchored)
+        return anchored.log() - self.twin.episode_costs(policy, self.start, self.inputs).log()
+
+    def distances(self, policy: nn.Module) -> Costs:
+        r"""Mean :math:`\|\pi - a\|^2` of a policy's actions and the flown ones, in shares of half their ranges."""
+        half = 0.5 * (self.high - self.low)
+        found = []
+        for states, observed, flown in self._seen:
+            applied = self.twin.plant.actuate(states, policy(observed))
+            found.append(((applied - flown) / half).square().sum(-1).mean())
+        return torch.stack(found)
