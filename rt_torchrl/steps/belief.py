@@ -242,7 +242,8 @@ class Belief:
         if twin not in self._twins:
             self._twins[twin] = AnchoredTwin(twin)
         records, inputs = [flown.trajectory for flown, _ in whole], torch.cat([inputs for _, inputs in whole])
-        replays = AnchoredReplays(self._twins[twin], records, inputs)
+        costs = inputs.new_tensor([flown.cost for flown, _ in whole])
+        replays = AnchoredReplays(self._twins[twin], records, inputs, costs)
         return Anchors(replays, self._growth(replays, [flown for flown, _ in whole]))
 
     def _growth(self, replays: AnchoredReplays, flown: Sequence[Flown]) -> float:

@@ -26,7 +26,7 @@ from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.shapes import Action, Costs, Hidden, Input, Inputs, Starts, State, Time
 from rt_torchrl.plants.signal import Signal, bounds, differences
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 OBSERVATIONS = 256
@@ -104,33 +104,39 @@ class AnchoredTwin:
 
 
 class AnchoredReplays:
-    """The anchored replays of real episodes of equal length on a twin with its present closure.
+    """The anchored replays of whole real episodes on a twin with its present closure.
 
     Args:
         twins: the twin.
         records: what was flown, with the states that sensors read.
-        inputs: exogenous inputs of each episode to its horizon; longer than a record that ended early.
+        inputs: exogenous inputs of each episode to its horizon, which a record that ended early does not reach.
+        costs: J_a of each episode as it was measured, which may be of more than what sensors read.
     """
 
-    def __init__(self, twins: AnchoredTwin, records: Sequence[Trajectory], inputs: Inputs):
+    def __init__(self, twins: AnchoredTwin, records: Sequence[Trajectory], inputs: Inputs, costs: Costs):
         self.twins, self.twin, plant = twins, twins.twin, twins.twin.plant
         self.start: Starts = plant.at_rest(torch.stack([record.states[0] for record in records]))
-        increments = [self.increments(record) for record in records]
-        longest = inputs.shape[1]
-        padded = [torch.cat([e, e.new_zeros(longest - len(e), e.shape[-1])]) for e in increments]
-        self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(padded)], -1)
-        self._seen = [self._observed(record) for record in records]
         self.low, self.high = bounds(plant.actions, device=inputs.device)
+        n, increments, counted = inputs.shape[1], [], []
+        for record, met in zip(records, inputs, strict=True):
+            states, missed = self._followed(record)
+            increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), missed.shape[-1])]))
+            rest = n - len(record.actions)  # the state in which it ended early
+            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (states, record.actions))
+            counted.append(control_cost(plant, Trajectory(states[None], actions[None], met[None])))
+        self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
+        self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
+        self._seen = [self._observed(record) for record in records]
 
     @torch.no_grad()
-    def increments(self, record: Trajectory) -> Float[Tensor, "n n_r"]:
-        """What the twin does not explain of the states that sensors read at the end of each interval."""
-        plant, n = self.twin.plant, len(record.actions)
-        read, driven = record.states, torch.cat([record.exogenous, record.states[:-1]], -1)
-        flown = self.twins.followed.replay(
-            plant.at_rest(read[:1]), driven[None], record.actions[None], start=record.start
-        )
-        return differences(plant.readings, read[1:], flown.states[0, 1 : n + 1, : read.shape[-1]])
+    def _followed(self, record: Trajectory) -> tuple[State, Float[Tensor, "n n_r"]]:
+        """The states of an episode, hidden ones as the twin has them, and what the twin does not explain of each."""
+        plant, read = self.twin.plant, record.states
+        driven = torch.cat([record.exogenous, read[:-1]], -1)
+        begins, rows = plant.at_rest(read[:1]), (driven[None], record.actions[None])
+        flown = self.twins.followed.replay(begins, *rows, start=record.start).states[0]
+        r = read.shape[-1]
+        return torch.cat([read, flown[:, r:]], -1), differences(plant.readings, read[1:], flown[1:, :r])
 
     def _observed(self, record: Trajectory) -> tuple[State, Tensor, Action]:
         """Some states of an episode, what policies observe there, and the actions that were flown there."""
@@ -144,11 +150,14 @@ class AnchoredReplays:
     def corrections(self, policy: nn.Module) -> Costs:
         r"""The log :math:`c_i = \log\tilde J_i - \log\hat J_i` of what each anchored replay costs over the twin's own.
 
+        What an episode cost beyond what sensors read of it counts, too. A cost that is not positive has no log, and is
+        not corrected.
+
         Raises:
             DivergenceError: if a replay diverges under the policy.
         """
         anchored = self.twins.anchored.episode_costs(policy, self.start, self.anchored)
-        return anchored.log() - self.twin.episode_costs(policy, self.start, self.inputs).log()
+        return _log_ratio(anchored, self.twin.episode_costs(policy, self.start, self.inputs)) + self.offsets
 
     def distances(self, policy: nn.Module) -> Costs:
         r"""Mean :math:`\|\pi - a\|^2` of a policy's actions and the flown ones, in shares of half their ranges."""
@@ -158,3 +167,9 @@ class AnchoredReplays:
             applied = self.twin.plant.actuate(states, policy(observed))
             found.append(((applied - flown) / half).square().sum(-1).mean())
         return torch.stack(found)
+
+
+def _log_ratio(costs: Costs, others: Costs) -> Costs:
+    """The log of the ratio of costs, zero where one is not positive."""
+    positive = (costs > 0.0) & (others > 0.0)
+    return torch.where(positive, costs, 1.0).log() - torch.where(positive, others, 1.0).log()
