@@ -235,7 +235,7 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     resumed = with_all_parts(tmp_path / "parts", 3, resume=True)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
     assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].turns.pause > 1
-    assert resumed.algorithm.belief.contradicted
+    assert resumed.algorithm.belief.flown
     assert_same(found, resumed.train())
     learned = whole.algorithm.policies["model_free"].parameters()
     assert not any(torch.equal(*pair) for pair in zip(started, learned, strict=True))

@@ -2,23 +2,22 @@ r"""What a policy costs on the real system: a belief over policies, learned from
 
 The twin flies each of the latest real episodes again under the policy, alone and with what it did not explain of the
 episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin says,
-the better the nearer the policy is to what was flown. Its error has the variance
+the better the nearer the policy is to the one that flew. What is left is a Gaussian process h over policies,
 
-.. math:: s_i^2 = \sigma^2 + v\,\|\pi - a_i\|^2
+.. math::
+    d(\pi) = c_i(\pi) + h(\pi) - h(\pi_i) + \varepsilon_i, \qquad
+    k(\pi, \pi') = A^2\exp\big(-\tfrac12\|\pi - \pi'\|^2/\ell^2\big), \qquad \varepsilon_i \sim N(0, \sigma^2)
 
-with the mean squared difference of the actions in the observations of the episode, in shares of half their ranges. The
-corrections together have mean and variance
-
-.. math:: m = s^2\sum_i c_i/s_i^2, \qquad s^{-2} = \sum_i s_i^{-2}
-
-and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans,
-updates, clones and the referee of step 6 take this one. How well the episodes predict each other chooses v: a twin that
-has been right keeps the word.
+whose distance is the root mean square of the difference of actions, in shares of half their ranges. The best linear
+unbiased estimate of d from all :math:`c_i` has a mean m and a variance s², and the cost that is expected on the real
+system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6 take
+this one. How well the episodes predict each other chooses A: a twin that has been right keeps the word.
 """
 
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -40,15 +39,17 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 HISTORY = 20
 """Number of latest real episodes that are kept."""
 ANCHORS = 8
-"""Number of latest whole episodes whose anchored replays correct the twin."""
+"""Number of latest whole episodes whose anchored replays plans descend on; policies are judged by those of all."""
 NOISE = 0.05
 """Standard deviation σ of the correction by an episode that was flown with the policy: what differs between inputs."""
-GROWTH = 10.0
-"""The variance v that is expected beforehand, as a multiple of the mean square of the corrections that were met."""
+LENGTH = 0.1
+"""Distance ℓ of neighbours."""
+AMPLITUDE = 0.1
+"""The A² that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
 PRIOR = 2.0
 """Number of episodes that this expectation counts for."""
-LEAST = 1e-6
-"""Least v. A policy that never flew costs nothing more on a right twin: small gains count there."""
+LEAST = 1e-8
+"""Least A². A policy that never flew costs nothing more on a right twin: small gains count there."""
 EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration, as a share of half the ranges."""
 DEARER = 5.0
@@ -82,10 +83,10 @@ class Judged(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The anchored replays of the latest real episodes, and the growth v of the variance of their corrections."""
+    """The anchored replays of the latest real episodes, and the variance A² of what they leave over."""
 
     replays: AnchoredReplays
-    growth: float
+    variance: float
 
 
 class Belief:
@@ -105,7 +106,7 @@ class Belief:
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins: dict[DigitalTwin, AnchoredTwin] = {}
         if corrects:
-            virtual.twin.correct(self.correction)
+            virtual.twin.correct(partial(self.correction, latest=ANCHORS))
 
     def append(
         self,
@@ -209,10 +210,14 @@ class Belief:
         except DivergenceError:
             return math.inf
 
-    def correction(self, policy: nn.Module) -> Float[Tensor, ""]:
+    def correction(self, policy: nn.Module, *, latest: int = HISTORY) -> Float[Tensor, ""]:
         """The log m + s²/2 of the expected cost over the twin's, differentiable by the policy's weights.
 
         It is zero before the first whole episode, and for state feedback, which is no function of an observation.
+
+        Args:
+            policy: the policy.
+            latest: number of latest whole episodes that it comes from.
 
         Raises:
             DivergenceError: if a replay diverges under the policy.
@@ -220,9 +225,15 @@ class Belief:
         anchors = self._anchors()
         if anchors is None or isinstance(policy, StateFeedback):
             return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
-        precisions = 1.0 / (NOISE**2 + anchors.growth * anchors.replays.distances(policy))
-        mean = (precisions * anchors.replays.corrections(policy)).sum() / precisions.sum()
-        return mean + 0.5 / precisions.sum()
+        replays, variance = anchors.replays.latest(latest), anchors.variance
+        apart = (replays.actions(policy) - replays.flown).square().sum(-1)
+        with torch.no_grad():
+            among = variance * nearness(torch.cdist(replays.flown, replays.flown).square())
+            noise = torch.diag(NOISE**2 + 2.0 * variance * (1.0 - nearness(replays.explored)))
+        near = variance * nearness(apart)
+        covariance = variance - near - near.unsqueeze(-1) + among + noise
+        weights = torch.linalg.solve(covariance, torch.ones_like(near))
+        return ((weights * replays.corrections(policy)).sum() + 0.5) / weights.sum()
 
     def _anchors(self) -> "Anchors | None":
         """The latest whole episodes on the present twin; None without any."""
@@ -236,44 +247,40 @@ class Belief:
     def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
         n = twin.plant.n_steps
         repeated = [(flown, self.virtual.repeated(flown.trajectory).exogenous) for flown in self.flown]
-        whole = [(flown, inputs) for flown, inputs in repeated if inputs.shape[1] == n][-ANCHORS:]
+        whole = [pair for pair in repeated if pair[1].shape[1] == n and not self._feeds_back(pair[0])]
         if not whole:
             return None
         if twin not in self._twins:
             self._twins[twin] = AnchoredTwin(twin)
         records, inputs = [flown.trajectory for flown, _ in whole], torch.cat([inputs for _, inputs in whole])
         costs = inputs.new_tensor([flown.cost for flown, _ in whole])
-        replays = AnchoredReplays(self._twins[twin], records, inputs, costs)
-        return Anchors(replays, self._growth(replays, [flown for flown, _ in whole]))
+        policies = [self.policy_of(flown) for flown, _ in whole]
+        replays = AnchoredReplays(self._twins[twin], records, inputs, costs, policies)
+        return Anchors(replays, self._variance(replays.latest(ANCHORS), policies[-ANCHORS:]))
 
-    def _growth(self, replays: AnchoredReplays, flown: Sequence[Flown]) -> float:
-        """The most likely growth v of the variance of corrections with the distance of a policy."""
-        met, pairs = list[float](), list[tuple[float, float]]()
-        for k, episode in enumerate(flown):
-            policy = self.policy_of(episode)
-            if isinstance(policy, StateFeedback):
-                continue
-            distances = replays.distances(policy).tolist()
+    def _feeds_back(self, flown: Flown) -> bool:
+        """Whether state feedback flew an episode, which is no function of an observation."""
+        return isinstance(self._policies[flown.role], StateFeedback)
+
+    def _variance(self, replays: AnchoredReplays, policies: Sequence[nn.Module]) -> float:
+        """The most likely A², by how well each episode predicts the corrections of the others."""
+        rows = list[Tensor]()
+        for policy in policies:
             try:
-                corrections = replays.corrections(policy).tolist()
+                rows.append(replays.corrections(policy))
             except DivergenceError:
-                corrections = [DEARER] * len(flown)
-            met.append(corrections[k])
-            pairs += [
-                (corrections[k] - other, far)
-                for i, (other, far) in enumerate(zip(corrections, distances, strict=True))
-                if i != k
-            ]
-        if not met:
-            return LEAST
-        expected = max(LEAST, GROWTH * sum(c * c for c in met) / len(met))
-        share = 1.0 / max(1, len(flown) - 1)
+                rows.append(torch.full_like(replays.offsets, DEARER))
+        corrections = torch.stack(rows)
+        met, others = corrections.diag(), ~torch.eye(len(rows), dtype=torch.bool, device=corrections.device)
+        errors = (met.unsqueeze(-1) - corrections)[others].square().clamp(max=DEARER)
+        shares = 2.0 * (1.0 - nearness(torch.cdist(replays.flown, replays.flown).square()))[others]
+        expected = max(LEAST, AMPLITUDE * met.square().mean().item())
 
-        def unlikely(log_growth: float) -> float:
-            v = math.exp(log_growth)
-            variances = [(min(error * error, DEARER), 2.0 * NOISE**2 + v * far) for error, far in pairs]
-            misfit = sum(math.log(variance) + square / variance for square, variance in variances)
-            return PRIOR * (log_growth + expected / v) + share * misfit
+        def unlikely(log_variance: float) -> float:
+            variance = math.exp(log_variance)
+            spread = 2.0 * NOISE**2 + variance * shares
+            misfit = (spread.log() + errors / spread).sum().item() / max(1, len(rows) - 1)
+            return PRIOR * (log_variance + expected / variance) + misfit
 
         around = math.log(expected)
         return math.exp(minimize_scalar(unlikely, bounds=(around - 5.0, around + 5.0), method="bounded").x)
@@ -309,6 +316,11 @@ class Belief:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
         self._differences = self._anchored = None
+
+
+def nearness(squares: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
+    """The correlation of h between policies, by the squares of their distances."""
+    return torch.exp(-0.5 * squares / LENGTH**2)
 
 
 def difference(real: float, predicted: float) -> float:

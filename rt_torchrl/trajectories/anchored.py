@@ -15,6 +15,8 @@ Sources: iterative learning control (Bristow, Tharayil, Alleyne, IEEE Control Sy
 model along real trajectories (Abbeel, Quigley, Ng, ICML 2006).
 """
 
+import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,7 +31,7 @@ from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-OBSERVATIONS = 256
+OBSERVATIONS = 64
 """Greatest number of observations of an episode in which actions are compared."""
 
 
@@ -111,9 +113,21 @@ class AnchoredReplays:
         records: what was flown, with the states that sensors read.
         inputs: exogenous inputs of each episode to its horizon, which a record that ended early does not reach.
         costs: J_a of each episode as it was measured, which may be of more than what sensors read.
+        policies: what flew each episode.
+
+    Attributes:
+        flown: the actions of each of these policies, as :meth:`actions` gives them.
+        explored: mean square of the actions that each episode had beside those of its policy, in the same unit.
     """
 
-    def __init__(self, twins: AnchoredTwin, records: Sequence[Trajectory], inputs: Inputs, costs: Costs):
+    def __init__(
+        self,
+        twins: AnchoredTwin,
+        records: Sequence[Trajectory],
+        inputs: Inputs,
+        costs: Costs,
+        policies: Sequence[nn.Module],
+    ):
         self.twins, self.twin, plant = twins, twins.twin, twins.twin.plant
         self.start: Starts = plant.at_rest(torch.stack([record.states[0] for record in records]))
         self.low, self.high = bounds(plant.actions, device=inputs.device)
@@ -127,6 +141,24 @@ class AnchoredReplays:
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
         self._seen = [self._observed(record) for record in records]
+        with torch.no_grad():
+            self.flown = torch.stack([self.actions(policy) for policy in policies])
+            applied = torch.cat([actions for _, _, actions in self._seen])
+            beside = self.flown - self._scaled(applied)
+        counts = [len(actions) for _, _, actions in self._seen]
+        own = [rows.split([n * applied.shape[-1] for n in counts])[k] for k, rows in enumerate(beside)]
+        self.explored: Costs = torch.stack(
+            [row.square().sum() * len(applied) / n for row, n in zip(own, counts, strict=True)]
+        )
+
+    def latest(self, count: int) -> "AnchoredReplays":
+        """Those of the last episodes, at most as many."""
+        if count >= len(self.start):
+            return self
+        found = copy.copy(self)
+        found.start, found.inputs, found.anchored = (x[-count:] for x in (self.start, self.inputs, self.anchored))
+        found.offsets, found.flown, found.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
+        return found
 
     @torch.no_grad()
     def _followed(self, record: Trajectory) -> tuple[State, Float[Tensor, "n n_r"]]:
@@ -159,14 +191,16 @@ class AnchoredReplays:
         anchored = self.twins.anchored.episode_costs(policy, self.start, self.anchored)
         return _log_ratio(anchored, self.twin.episode_costs(policy, self.start, self.inputs)) + self.offsets
 
-    def distances(self, policy: nn.Module) -> Costs:
-        r"""Mean :math:`\|\pi - a\|^2` of a policy's actions and the flown ones, in shares of half their ranges."""
-        half = 0.5 * (self.high - self.low)
-        found = []
-        for states, observed, flown in self._seen:
-            applied = self.twin.plant.actuate(states, policy(observed))
-            found.append(((applied - flown) / half).square().sum(-1).mean())
-        return torch.stack(found)
+    def actions(self, policy: nn.Module) -> Float[Tensor, " m"]:
+        """A policy's actions in some observations of the episodes, of which the squared difference is the mean square.
+
+        They are those that the actuators make of its commands, in shares of half their ranges.
+        """
+        states, observed = (torch.cat(parts) for parts in list(zip(*self._seen, strict=True))[:2])
+        return self._scaled(self.twin.plant.actuate(states, policy(observed)))
+
+    def _scaled(self, actions: Float[Tensor, "k n_a"]) -> Float[Tensor, " m"]:
+        return (2.0 * actions / (self.high - self.low)).flatten() / math.sqrt(len(actions))
 
 
 def _log_ratio(costs: Costs, others: Costs) -> Costs:

@@ -1,0 +1,269 @@
+"""Anchored replays against closed loops of the true system, and the belief that they make."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.unknown import unknown as tank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.unknown import unknown as drone
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
+from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.plants.sensors import UnreadInput
+from rt_torchrl.steps.belief import ANCHORS, LEAST, LENGTH, NOISE, Belief
+from rt_torchrl.steps.config import ExogenousConfig
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.trajectories.anchored import AnchoredReplays, AnchoredTwin
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+
+def flown_on(real, policy, physics, *, seed=0, count=2, noise=0.0):
+    """Records of the real system under a policy, the inputs, and J_a; actions explore by a share of a unit."""
+    generator = torch.Generator().manual_seed(seed)
+    starts, inputs = real.draw_initial_state(count, generator), real.draw_exogenous(count, generator)
+    with torch.no_grad():
+        rollout = Rollout(real, real.closure, policy)
+        flown, costs = rollout(starts, inputs), rollout.costs(starts, inputs)
+        if noise:
+            commands = flown.actions + noise * torch.randn(flown.actions.shape, generator=generator).double()
+            rollout = Rollout(real, real.closure)
+            flown, costs = rollout(starts, inputs, commands), rollout.costs(starts, inputs, commands)
+    states = flown.states[..., : len(physics.readings)]
+    return [Trajectory(states[k], flown.actions[k], inputs[k]) for k in range(count)], inputs, costs
+
+
+def replays_on(plant, records, inputs, costs, policy, closure=None):
+    """Replays of what one policy has flown, on a twin."""
+    twins = AnchoredTwin(DigitalTwin(plant, closure or plant.closure))
+    return AnchoredReplays(twins, records, inputs, costs, [policy] * len(records))
+
+
+def anchored_costs(replays, policy):
+    """J_a that the anchored replays say of a policy."""
+    alone = replays.twin.episode_costs(policy, replays.start, replays.inputs)
+    return (alone * replays.corrections(policy).exp()).detach()
+
+
+SHIPPED = {
+    "turbine": (WindTurbine(horizon=60.0), turbine, "inflow"),
+    "drone": (FlappingWing(horizon=0.2), drone, "all_2"),
+    "tank": (CryogenicTank(horizon=36e3), tank, "all"),
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("suspected", [False, True])
+def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
+    """Whatever the twin lacks, with its first guess of the closure, and with a hypothesis that is wrong."""
+    physics, unknown, system = SHIPPED[name]
+    generator = torch.Generator().manual_seed(1)
+    policy = physics.make_policy(generator)
+    records, inputs, costs = flown_on(unknown(physics, [system]), policy, physics)
+    plant, closure = physics, physics.make_closure(generator)
+    if suspected:
+        plant = list(physics.suspects().values())[-1]
+        closure = plant.extended(closure)
+    replays = replays_on(plant, records, inputs, costs, policy, closure)
+    alone = replays.twin.episode_costs(policy, replays.start, inputs).detach()
+    assert anchored_costs(replays, policy).tolist() == pytest.approx(costs.tolist(), rel=1e-9)
+    assert (alone / costs - 1.0).abs().max() > 1e-4
+    assert torch.equal(replays.flown[0], replays.actions(policy)) and replays.explored.tolist() == [0.0, 0.0]
+
+
+def pushed(horizon=5.0):
+    """A linear plant on which more acts than its sensor reads, and the plant that its twin knows."""
+    physics = LinearQuadratic(horizon=horizon)
+    return UnreadInput(physics, "disturbance", 1.0, (0.7, 1.9)), physics
+
+
+def test_an_unread_force_on_a_linear_plant_is_replayed_exactly_under_any_policy():
+    """Its Jacobians are those of the twin, so that anchored replays are no approximation."""
+    real, physics = pushed()
+    first, other = LinearGain([[0.5, 0.5]]), LinearGain([[3.0, 2.0]])
+    records, inputs, costs = flown_on(real, first, physics)
+    replays = replays_on(physics, records, inputs, costs, first)
+    starts = real.draw_initial_state(2, torch.Generator().manual_seed(0))
+    true = Rollout(real, real.closure, other).costs(starts, inputs).tolist()
+    assert anchored_costs(replays, other).tolist() == pytest.approx(true, rel=1e-9)
+    alone = replays.twin.episode_costs(other, replays.start, inputs).tolist()
+    assert alone != pytest.approx(true, rel=0.1)
+
+
+def test_gradients_of_corrections_agree_with_finite_differences():
+    real, physics = pushed(horizon=2.0)
+    policy = LinearGain([[0.6, 0.4]])
+    records, inputs, costs = flown_on(real, policy, physics)
+    replays = replays_on(physics, records, inputs, costs, policy, LinearClosure([[0.1, 0.0], [0.3, -0.2]]))
+    with torch.no_grad():
+        policy.gain += 0.2
+    for measure in (replays.corrections, replays.actions):
+        (slope,) = torch.autograd.grad(measure(policy).sum(), [policy.gain])
+        for k in range(2):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved = copy.deepcopy(policy)
+                with torch.no_grad():
+                    moved.gain[0, k] += step
+                ends.append(measure(moved).sum().item())
+            assert slope[0, k].item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
+
+
+def test_distances_are_those_of_actions_in_shares_of_half_their_range():
+    real, physics = pushed()
+    policy, generator = LinearGain([[0.5, 0.0]]), torch.Generator().manual_seed(7)
+    records, inputs, costs = flown_on(real, policy, physics, count=1)
+    beside = torch.randn(records[0].actions.shape, generator=generator, dtype=torch.float64)
+    records = [records[0]._replace(actions=records[0].actions + beside)]
+    replays = replays_on(physics, records, inputs, costs, policy)
+    distance = (replays.actions(LinearGain([[0.9, 0.0]])) - replays.flown[0]).square().sum().item()
+    positions = records[0].states[:-1, 0]  # fifty intervals, all of which are compared
+    assert distance == pytest.approx((0.4 * positions / 2.0).square().mean().item(), rel=1e-12)
+    assert replays.explored.item() == pytest.approx((beside / 2.0).square().mean().item(), rel=1e-12)
+
+
+def test_what_sensors_do_not_read_of_a_cost_counts():
+    real, physics = pushed()
+    policy = LinearGain([[0.5, 0.5]])
+    records, inputs, costs = flown_on(real, policy, physics)
+    assert anchored_costs(replays_on(physics, records, inputs, 3.0 * costs, policy), policy).tolist() == pytest.approx(
+        (3.0 * costs).tolist()
+    )
+    free = replays_on(physics, records, inputs, torch.zeros_like(costs), policy)  # a cost of zero has no log
+    assert anchored_costs(free, policy).tolist() == pytest.approx(costs.tolist())
+
+
+def belief_of(real, physics, gains, *, closure=None, noise=0.0):
+    """The belief after one flight with each of some gains, which began alike under other inputs."""
+    twin = DigitalTwin(physics, closure or physics.closure)
+    virtual = VirtualEpisodes(twin, ExogenousConfig(), 3, generator=torch.Generator().manual_seed(0))
+    belief = Belief({"model_based": LinearGain([[0.0, 0.0]])}, virtual)
+    for seed, gain in enumerate(gains):
+        policy = LinearGain([gain])
+        (record,), _, cost = flown_on(real, policy, physics, seed=seed, count=1, noise=noise)
+        belief.append(record, "model_based", cost.item(), weights=policy.state_dict())
+    return belief
+
+
+def virtual_episodes(physics, count=20):
+    generator = torch.Generator().manual_seed(99)
+    return Scenario(physics.draw_initial_state(count, generator), physics.draw_exogenous(count, generator))
+
+
+def test_a_twin_that_has_been_right_keeps_the_word():
+    physics = LinearQuadratic()
+    belief = belief_of(physics, physics, [(0.5, 0.5), (0.6, 0.5)])
+    assert belief.correction(LinearGain([[2.0, 2.0]])).item() == pytest.approx(0.0, abs=NOISE**2)
+    assert belief._anchors().variance < 200.0 * LEAST
+    assert belief.expected(LinearGain([[0.5, 0.5]]), -4.0) == -4.0
+    assert belief.expected(LinearGain([[0.5, 0.5]]), math.inf) == math.inf
+
+
+def test_corrections_of_episodes_are_combined_as_a_gaussian_process_says():
+    """By the textbook: d is c_i + h(π) − h(π_i), estimated by least squares with the covariance of these."""
+    real, physics = pushed()
+    belief, policy = belief_of(real, physics, [(0.5, 0.5), (0.7, 0.4), (0.7, 0.4)]), LinearGain([[0.65, 0.5]])
+    anchors = belief._anchors()
+    points = torch.cat([anchors.replays.actions(policy)[None], anchors.replays.flown]).detach().numpy()
+    c = anchors.replays.corrections(policy).detach().numpy()
+    apart = ((points[:, None] - points[None]) ** 2).sum(-1)
+    k = anchors.variance * np.exp(-0.5 * apart / LENGTH**2)
+    differences = np.concatenate([np.ones((3, 1)), -np.eye(3)], 1)  # of h at the policy and at what flew
+    covariance = differences @ k @ differences.T + NOISE**2 * np.eye(3)
+    weights = np.linalg.solve(covariance, np.ones(3))
+    mean, variance = weights @ c / weights.sum(), 1.0 / weights.sum()
+    assert belief.correction(policy).item() == pytest.approx(mean + 0.5 * variance, rel=1e-9)
+    assert belief.expected(policy, 2.0) == pytest.approx(2.0 * math.exp(mean + 0.5 * variance))
+
+
+def test_a_policy_that_flew_costs_what_it_did_and_a_distant_one_has_its_risk():
+    lagging, physics = LaggedActuator(LinearQuadratic(), "force", 0.5), LinearQuadratic()
+    belief = belief_of(lagging, physics, [(2.0, 0.5)])
+    (record,), inputs, cost = flown_on(lagging, LinearGain([[2.0, 0.5]]), physics, count=1)
+    episode = Scenario(record.states[:1], inputs)
+    assert belief.judge(LinearGain([[2.0, 0.5]]), episode).expected == pytest.approx(cost.item(), rel=2.0 * NOISE**2)
+    risks = []
+    for gain in (2.0, 2.5, 4.0):
+        policy, anchors = LinearGain([[gain, 0.5]]), belief._anchors()
+        risks.append(belief.correction(policy).item() - anchors.replays.corrections(policy).item())
+    assert risks[0] == pytest.approx(0.5 * NOISE**2) and risks[0] < risks[1] < risks[2]
+
+
+class Told:
+    """Replays whose corrections are known of each policy, a multiple of ten of which says how far it is from others."""
+
+    def __init__(self, corrections):
+        self.told, self.flown = corrections, torch.tensor([[0.0], [0.1], [0.2]]).double()
+
+    def corrections(self, policy):
+        return torch.tensor(self.told[round(10.0 * policy.gain[0, 0].item())]).double()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.1, 1.0])
+def test_the_variance_is_the_most_likely_one(apart):
+    """Three episodes; each predicts the others' corrections of 1 but for an error; the optimum is found on a grid."""
+    physics = LinearQuadratic(horizon=2.0)
+    belief = belief_of(physics, physics, [])
+    corrections = [[1.0 + apart * (k - j) for k in range(3)] for j in range(3)]
+    found = belief._variance(Told(corrections), [LinearGain([[gain, 0.0]]) for gain in (0.0, 0.1, 0.2)])
+    best = (math.inf, 0.0)
+    for v in [0.1 * math.exp(5.0 * k / 500.0) for k in range(-500, 501)]:
+        chances = 2.0 * (math.log(v) + 0.1 / v)
+        for j in range(3):
+            for k in {0, 1, 2} - {j}:
+                variance = 2.0 * NOISE**2 + 2.0 * v * (1.0 - math.exp(-0.5 * (0.1 * (j - k) / LENGTH) ** 2))
+                chances += 0.5 * (math.log(variance) + (corrections[j][j] - corrections[j][k]) ** 2 / variance)
+        best = min(best, (chances, v))
+    assert found == pytest.approx(best[1], rel=0.02)
+
+
+def test_an_episode_that_explored_says_less():
+    real, physics = pushed()
+    beliefs = [belief_of(real, physics, [(0.5, 0.5)], noise=noise) for noise in (0.0, 0.5)]
+    risks = [
+        belief.correction(policy).item() - belief._anchors().replays.corrections(policy).item()
+        for belief in beliefs
+        for policy in [LinearGain([[0.5, 0.5]])]
+    ]
+    assert risks[0] == pytest.approx(0.5 * NOISE**2) and risks[1] > 2.0 * risks[0]
+
+
+def test_the_latest_whole_episodes_are_replayed_and_again_where_the_twin_has_changed():
+    real, physics = pushed(horizon=2.0)
+    belief = belief_of(real, physics, [(0.5 + 0.01 * k, 0.5) for k in range(ANCHORS + 2)])
+    part = belief.flown[-1].trajectory.part(0, 10, physics.dt)
+    belief.append(part, "model_based", 1.0)
+    anchors, policy = belief._anchors(), LinearGain([[0.52, 0.5]])
+    assert len(anchors.replays.start) == ANCHORS + 2 and belief._anchors() is anchors
+    few = anchors.replays.latest(ANCHORS)
+    assert torch.equal(few.corrections(policy), anchors.replays.corrections(policy)[2:])
+    assert belief.correction(policy, latest=ANCHORS) != belief.correction(policy)
+    with torch.no_grad():
+        belief.virtual.twin.closure.matrix[0, 0] += 1e-3
+    assert belief._anchors() is not anchors
+
+
+def test_plans_on_expected_costs_find_what_the_twin_alone_does_not():
+    """With one anchored record of an unread force the gradient is that of the real episode."""
+    real, physics = pushed()
+    gain = (0.5, 0.5)
+    belief, policy = belief_of(real, physics, [gain]), LinearGain([list(gain)])
+    (record,), inputs, _ = flown_on(real, policy, physics, count=1)
+    twin, start = belief.virtual.twin, real.draw_initial_state(1, torch.Generator().manual_seed(0))
+    slopes = []
+    for cost in (
+        Rollout(real, real.closure, policy).costs(start, inputs).mean().log(),
+        twin.expected_costs(policy, record.states[:1], inputs).mean().log(),
+        twin.episode_costs(policy, record.states[:1], inputs).mean().log(),
+    ):
+        (slope,) = torch.autograd.grad(cost, [policy.gain])
+        slopes.append(slope)
+    assert torch.allclose(slopes[1], slopes[0], rtol=1e-6)
+    assert not torch.allclose(slopes[2], slopes[0], rtol=0.05)
