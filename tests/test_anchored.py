@@ -161,24 +161,22 @@ def test_a_twin_that_has_been_right_keeps_the_word():
     physics = LinearQuadratic()
     belief = belief_of(physics, physics, [(0.5, 0.5), (0.6, 0.5)])
     assert belief.correction(LinearGain([[2.0, 2.0]])).item() == pytest.approx(0.0, abs=NOISE**2)
-    assert belief._anchors().variance < 200.0 * LEAST
+    assert belief._anchors().growth < 200.0 * LEAST
     assert belief.expected(LinearGain([[0.5, 0.5]]), -4.0) == -4.0
     assert belief.expected(LinearGain([[0.5, 0.5]]), math.inf) == math.inf
 
 
-def test_corrections_of_episodes_are_combined_as_a_gaussian_process_says():
-    """By the textbook: d is c_i + h(π) − h(π_i), estimated by least squares with the covariance of these."""
+def test_corrections_are_averaged_and_those_of_like_policies_count_once():
     real, physics = pushed()
-    belief, policy = belief_of(real, physics, [(0.5, 0.5), (0.7, 0.4), (0.7, 0.4)]), LinearGain([[0.65, 0.5]])
+    belief, policy = belief_of(real, physics, [(0.5, 0.5), (1.5, 0.4), (1.5, 0.4)]), LinearGain([[1.0, 0.5]])
     anchors = belief._anchors()
     points = torch.cat([anchors.replays.actions(policy)[None], anchors.replays.flown]).detach().numpy()
     c = anchors.replays.corrections(policy).detach().numpy()
     apart = ((points[:, None] - points[None]) ** 2).sum(-1)
-    k = anchors.variance * np.exp(-0.5 * apart / LENGTH**2)
-    differences = np.concatenate([np.ones((3, 1)), -np.eye(3)], 1)  # of h at the policy and at what flew
-    covariance = differences @ k @ differences.T + NOISE**2 * np.eye(3)
-    weights = np.linalg.solve(covariance, np.ones(3))
-    mean, variance = weights @ c / weights.sum(), 1.0 / weights.sum()
+    alike = np.exp(-0.5 * apart[1:, 1:] / LENGTH**2).sum(1)
+    assert alike.tolist() == pytest.approx([1.0, 2.0, 2.0], abs=0.1)
+    precisions = 1.0 / alike / (NOISE**2 + anchors.growth * apart[0, 1:])
+    mean, variance = precisions @ c / precisions.sum(), 1.0 / precisions.sum()
     assert belief.correction(policy).item() == pytest.approx(mean + 0.5 * variance, rel=1e-9)
     assert belief.expected(policy, 2.0) == pytest.approx(2.0 * math.exp(mean + 0.5 * variance))
 
@@ -200,25 +198,29 @@ class Told:
     """Replays whose corrections are known of each policy, a multiple of ten of which says how far it is from others."""
 
     def __init__(self, corrections):
-        self.told, self.flown = corrections, torch.tensor([[0.0], [0.1], [0.2]]).double()
+        self.told = corrections
+
+    def distances(self):
+        places = torch.tensor([0.0, 0.1, 0.2]).double()
+        return (places.unsqueeze(-1) - places).square()
 
     def corrections(self, policy):
         return torch.tensor(self.told[round(10.0 * policy.gain[0, 0].item())]).double()
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.1, 1.0])
-def test_the_variance_is_the_most_likely_one(apart):
+def test_the_growth_is_the_most_likely_one(apart):
     """Three episodes; each predicts the others' corrections of 1 but for an error; the optimum is found on a grid."""
     physics = LinearQuadratic(horizon=2.0)
     belief = belief_of(physics, physics, [])
     corrections = [[1.0 + apart * (k - j) for k in range(3)] for j in range(3)]
-    found = belief._variance(Told(corrections), [LinearGain([[gain, 0.0]]) for gain in (0.0, 0.1, 0.2)])
+    found = belief._growth(Told(corrections), [LinearGain([[gain, 0.0]]) for gain in (0.0, 0.1, 0.2)])
     best = (math.inf, 0.0)
-    for v in [0.1 * math.exp(5.0 * k / 500.0) for k in range(-500, 501)]:
-        chances = 2.0 * (math.log(v) + 0.1 / v)
+    for v in [10.0 * math.exp(5.0 * k / 500.0) for k in range(-500, 501)]:
+        chances = 2.0 * (math.log(v) + 10.0 / v)
         for j in range(3):
             for k in {0, 1, 2} - {j}:
-                variance = 2.0 * NOISE**2 + 2.0 * v * (1.0 - math.exp(-0.5 * (0.1 * (j - k) / LENGTH) ** 2))
+                variance = 2.0 * NOISE**2 + v * (0.1 * (j - k)) ** 2
                 chances += 0.5 * (math.log(variance) + (corrections[j][j] - corrections[j][k]) ** 2 / variance)
         best = min(best, (chances, v))
     assert found == pytest.approx(best[1], rel=0.02)

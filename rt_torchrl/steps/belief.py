@@ -2,16 +2,19 @@ r"""What a policy costs on the real system: a belief over policies, learned from
 
 The twin flies each of the latest real episodes again under the policy, alone and with what it did not explain of the
 episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin says,
-the better the nearer the policy is to the one that flew. What is left is a Gaussian process h over policies,
+the better the nearer the policy is to the one that flew: its error has the variance
+
+.. math:: s_i^2 = \sigma^2 + v\,\|\pi - \pi_i\|^2
+
+with the mean square of the difference of actions, in shares of half their ranges. The corrections are averaged,
 
 .. math::
-    d(\pi) = c_i(\pi) + h(\pi) - h(\pi_i) + \varepsilon_i, \qquad
-    k(\pi, \pi') = A^2\exp\big(-\tfrac12\|\pi - \pi'\|^2/\ell^2\big), \qquad \varepsilon_i \sim N(0, \sigma^2)
+    m = s^2\sum_i\frac{c_i}{n_is_i^2}, \qquad \frac1{s^2} = \sum_i\frac1{n_is_i^2}, \qquad
+    n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
 
-whose distance is the root mean square of the difference of actions, in shares of half their ranges. The best linear
-unbiased estimate of d from all :math:`c_i` has a mean m and a variance s², and the cost that is expected on the real
-system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6 take
-this one. How well the episodes predict each other chooses A: a twin that has been right keeps the word.
+with the number n_i of episodes that policies like this one flew, which know the same. The cost that is expected on the
+real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6
+take this one. How well the episodes predict each other chooses v: a twin that has been right keeps the word.
 """
 
 import copy
@@ -43,13 +46,13 @@ ANCHORS = 8
 NOISE = 0.05
 """Standard deviation σ of the correction by an episode that was flown with the policy: what differs between inputs."""
 LENGTH = 0.1
-"""Distance ℓ of neighbours."""
-AMPLITUDE = 0.1
-"""The A² that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
+"""Distance ℓ of policies that are alike."""
+GROWTH = 10.0
+"""The v that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
 PRIOR = 2.0
 """Number of episodes that this expectation counts for."""
-LEAST = 1e-8
-"""Least A². A policy that never flew costs nothing more on a right twin: small gains count there."""
+LEAST = 1e-6
+"""Least v. A policy that never flew costs nothing more on a right twin: small gains count there."""
 EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration, as a share of half the ranges."""
 DEARER = 5.0
@@ -83,10 +86,10 @@ class Judged(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The anchored replays of the latest real episodes, and the variance A² of what they leave over."""
+    """The anchored replays of the latest real episodes, and the growth v of the variance of their corrections."""
 
     replays: AnchoredReplays
-    variance: float
+    growth: float
 
 
 class Belief:
@@ -225,15 +228,11 @@ class Belief:
         anchors = self._anchors()
         if anchors is None or isinstance(policy, StateFeedback):
             return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
-        replays, variance = anchors.replays.latest(latest), anchors.variance
+        replays = anchors.replays.latest(latest)
         apart = (replays.actions(policy) - replays.flown).square().sum(-1)
-        with torch.no_grad():
-            among = variance * nearness(torch.cdist(replays.flown, replays.flown).square())
-            noise = torch.diag(NOISE**2 + 2.0 * variance * (1.0 - nearness(replays.explored)))
-        near = variance * nearness(apart)
-        covariance = variance - near - near.unsqueeze(-1) + among + noise
-        weights = torch.linalg.solve(covariance, torch.ones_like(near))
-        return ((weights * replays.corrections(policy)).sum() + 0.5) / weights.sum()
+        alike = torch.exp(-0.5 * replays.distances() / LENGTH**2).sum(-1)
+        precisions = 1.0 / (alike * (NOISE**2 + anchors.growth * (apart + replays.explored)))
+        return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
 
     def _anchors(self) -> "Anchors | None":
         """The latest whole episodes on the present twin; None without any."""
@@ -256,14 +255,14 @@ class Belief:
         costs = inputs.new_tensor([flown.cost for flown, _ in whole])
         policies = [self.policy_of(flown) for flown, _ in whole]
         replays = AnchoredReplays(self._twins[twin], records, inputs, costs, policies)
-        return Anchors(replays, self._variance(replays.latest(ANCHORS), policies[-ANCHORS:]))
+        return Anchors(replays, self._growth(replays.latest(ANCHORS), policies[-ANCHORS:]))
 
     def _feeds_back(self, flown: Flown) -> bool:
         """Whether state feedback flew an episode, which is no function of an observation."""
         return isinstance(self._policies[flown.role], StateFeedback)
 
-    def _variance(self, replays: AnchoredReplays, policies: Sequence[nn.Module]) -> float:
-        """The most likely A², by how well each episode predicts the corrections of the others."""
+    def _growth(self, replays: AnchoredReplays, policies: Sequence[nn.Module]) -> float:
+        """The most likely v, by how well each episode predicts the corrections of the others."""
         rows = list[Tensor]()
         for policy in policies:
             try:
@@ -273,14 +272,14 @@ class Belief:
         corrections = torch.stack(rows)
         met, others = corrections.diag(), ~torch.eye(len(rows), dtype=torch.bool, device=corrections.device)
         errors = (met.unsqueeze(-1) - corrections)[others].square().clamp(max=DEARER)
-        shares = 2.0 * (1.0 - nearness(torch.cdist(replays.flown, replays.flown).square()))[others]
-        expected = max(LEAST, AMPLITUDE * met.square().mean().item())
+        distances = replays.distances()[others]
+        expected = max(LEAST, GROWTH * met.square().mean().item())
 
-        def unlikely(log_variance: float) -> float:
-            variance = math.exp(log_variance)
-            spread = 2.0 * NOISE**2 + variance * shares
-            misfit = (spread.log() + errors / spread).sum().item() / max(1, len(rows) - 1)
-            return PRIOR * (log_variance + expected / variance) + misfit
+        def unlikely(log_growth: float) -> float:
+            growth = math.exp(log_growth)
+            variances = 2.0 * NOISE**2 + growth * distances
+            misfit = (variances.log() + errors / variances).sum().item() / max(1, len(rows) - 1)
+            return PRIOR * (log_growth + expected / growth) + misfit
 
         around = math.log(expected)
         return math.exp(minimize_scalar(unlikely, bounds=(around - 5.0, around + 5.0), method="bounded").x)
@@ -316,11 +315,6 @@ class Belief:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
         self._differences = self._anchored = None
-
-
-def nearness(squares: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
-    """The correlation of h between policies, by the squares of their distances."""
-    return torch.exp(-0.5 * squares / LENGTH**2)
 
 
 def difference(real: float, predicted: float) -> float:

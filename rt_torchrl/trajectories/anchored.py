@@ -199,6 +199,10 @@ class AnchoredReplays:
         states, observed = (torch.cat(parts) for parts in list(zip(*self._seen, strict=True))[:2])
         return self._scaled(self.twin.plant.actuate(states, policy(observed)))
 
+    def distances(self) -> Float[Tensor, "episodes episodes"]:
+        """Mean square of the difference between the actions of what flew each two episodes."""
+        return (self.flown.unsqueeze(1) - self.flown).square().sum(-1)
+
     def _scaled(self, actions: Float[Tensor, "k n_a"]) -> Float[Tensor, " m"]:
         return (2.0 * actions / (self.high - self.low)).flatten() / math.sqrt(len(actions))
 
