@@ -1,7 +1,15 @@
 """The public names of the library; ``__init__.py`` imports each at its first use, from the module named here."""
 
 # Plants and their parts
-from .plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
+from .plants.actuators import (
+    DelayedActuator,
+    LaggedActuator,
+    PlayActuator,
+    RateLimitedActuator,
+    ResonantActuator,
+    ScaledActuator,
+    StickingActuator,
+)
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.vector_field import LaggedCoefficients, ScaledCoefficients
 from .plants.extension import ExtendedClosure, Extension
@@ -149,11 +157,13 @@ __all__ = [
     "Plant",
     "PlantContractError",
     "PlantEnv",
+    "PlayActuator",
     "PositiveCoefficients",
     "PredictiveConfig",
     "PredictiveControl",
     "Preset",
     "Preview",
+    "RateLimitedActuator",
     "Reading",
     "RealController",
     "RealSystem",
@@ -189,6 +199,7 @@ __all__ = [
     "StackedObservations",
     "Start",
     "StateFeedback",
+    "StickingActuator",
     "Trajectory",
     "Transition",
     "TwinEnsemble",

@@ -10,7 +10,15 @@ from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl import check_plant
-from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
+from rt_torchrl.plants.actuators import (
+    DelayedActuator,
+    LaggedActuator,
+    PlayActuator,
+    RateLimitedActuator,
+    ResonantActuator,
+    ScaledActuator,
+    StickingActuator,
+)
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.extension import ExtendedClosure, Extension
 from rt_torchrl.plants.plant import PARTS, Plant
@@ -240,6 +248,9 @@ SINGLY = {
     "resonance": lambda base: ResonantActuator(base, "force", 3.0, 0.4),
     "delay": lambda base: DelayedActuator(base, "force", 0.3),
     "scaled": lambda base: ScaledActuator(base, "force", 0.8),
+    "rate": lambda base: RateLimitedActuator(base, "force", 0.5),
+    "play": lambda base: PlayActuator(base, "force", 0.2),
+    "stiction": lambda base: StickingActuator(base, "force", 0.2),
     "inflow": lambda base: LaggedCoefficients(base, 0.5, (0.1, -0.2)),
     "share": lambda base: ScaledCoefficients(base, 0.9),
     "bias": lambda base: BiasedSensor(base, "position", 0.3, 0.02, scale=0.1),
@@ -339,3 +350,28 @@ def test_hidden_states_need_a_start():
     with pytest.raises(TypeError, match=r"Startless has hidden states.*rest\(\)"):
         Startless(LinearQuadratic(), [Signal(symbol="x", name="hidden", unit="-")])
     assert Startless(LinearQuadratic(), []).at_rest(torch.ones(1, 2).double()).tolist() == [[1.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "asked", "means", "ends"),
+    [
+        # At 2/s an interval of 0.1 s moves by 0.2; 0.1 is reached at half of the second interval.
+        (RateLimitedActuator, 2.0, [0.3, 0.3, 0.3, -1.0], [0.1, 0.275, 0.3, 0.2], [0.2, 0.3, 0.3, 0.1]),
+        (PlayActuator, 0.5, [0.4, 1.0, 0.6, -0.8, -0.2], [0.0, 0.5, 0.5, -0.3, -0.3], [0.0, 0.5, 0.5, -0.3, -0.3]),
+        (StickingActuator, 0.5, [0.4, 0.6, 0.2, 0.0], [0.0, 0.6, 0.6, 0.0], [0.0, 0.6, 0.6, 0.0]),
+    ],
+)
+def test_motions_by_hand(kind, size, asked, means, ends):
+    """What acts on the plant in each interval, and where the actuator is at its end."""
+    plant = kind(LinearQuadratic(dt=0.1), "force", size)
+    position, found = torch.zeros(1).double(), []
+    for action in asked:
+        acting, position = plant.respond(position, torch.tensor([action]).double(), plant.closure)
+        found.append((acting.item(), position.item()))
+    assert [mean for mean, _ in found] == pytest.approx(means) and [end for _, end in found] == pytest.approx(ends)
+
+
+@pytest.mark.parametrize("kind", [RateLimitedActuator, PlayActuator, StickingActuator])
+def test_a_size_that_is_none_is_refused(kind):
+    with pytest.raises(ValueError, match=r"size=0.0 N(/s)? of force must be positive and finite"):
+        kind(LinearQuadratic(), "force", 0.0)
