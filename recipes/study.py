@@ -280,7 +280,7 @@ class Yardstick:
         if self.kind == "optimum":
             effort = (FOR_PERCEPTRONS if config.policy == "mlp" else {}) | self.effort
             best = exact_optimum(episodes, make_policy, **effort)
-            return {"J_a": best.cost, "J_a_of_each_start": best.costs}
+            return {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         if (known := config.limit()) is None:
             raise ValueError(f"recipe={self.recipe} does not say how the limit is computed; override Config.limit().")
         few = episodes.first(self.effort["count"])

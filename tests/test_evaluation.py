@@ -13,6 +13,7 @@ from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.checks import engine_gap
 from rt_torchrl.evaluation.limits import exact_optimum
 from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
+from rt_torchrl.plants.actuators import StickingActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.trajectories.engines.interval import Autograd
@@ -31,6 +32,17 @@ def test_the_reference_reaches_the_riccati_gain_from_every_start():
     assert 0.98 * best < found.cost <= best
     assert found.cost == unseen.control_costs(found.policy).mean().item()
     assert max(found.costs) < 1.001 * min(found.costs)  # on the few, a quadratic-like cost of one minimum
+
+
+def test_the_reference_of_a_plant_with_stiction_is_that_of_a_grid_and_not_of_gradients():
+    """Gradients do not see where an actuator begins to slip."""
+    plant = StickingActuator(LinearQuadratic(noise=0.0), "force", 0.6)
+    unseen = UnseenEpisodes(plant, 6)
+    found = exact_optimum(unseen, random_gain, starts=2, iterations=25, few=6, polish=10)
+    grid = [(k, d) for k in torch.linspace(0.0, 3.0, 31) for d in torch.linspace(0.0, 3.0, 31)]
+    best = min(unseen.control_costs(LinearGain([list(map(float, gains))])).mean().item() for gains in grid)
+    assert found.cost == unseen.control_costs(found.policy).mean().item() <= 1.01 * best
+    assert found.cost < 0.99 * found.by_gradients
 
 
 class OnlyReal(RealController):

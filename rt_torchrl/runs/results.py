@@ -304,6 +304,7 @@ def reference_entry(
     compared = {
         "J_a": optimum.cost,
         "J_a_of_each_start": optimum.costs,
+        "J_a_by_gradients": optimum.by_gradients,
         "better_over_reference": cost / optimum.cost,
     }
     if known is not None:
