@@ -102,9 +102,14 @@ def test_planners_improve_their_policy_on_what_they_are_given(name):
     found = algorithm(planner=PLANNERS[name])
     flown(found, "interact", "inputs")
     episodes, policy = found.virtual.draw(8), found.policies["model_based"]
-    before = found.virtual.cost(policy, episodes)
-    plan = found.planner.plan(episodes)
-    after = found.virtual.cost(policy, episodes)
+
+    def cost():
+        """Whole episodes descend what is expected on the real system, the others what the twin says."""
+        if name != "whole episodes":
+            return found.virtual.cost(policy, episodes)
+        return found.twin.expected_costs(policy, *episodes).mean().item()
+
+    before, plan, after = cost(), found.planner.plan(episodes), cost()
     assert plan.start == pytest.approx(before, rel=1e-12) and plan.best == pytest.approx(after, rel=1e-12)
     assert after < before and plan.gradient > 0 and plan.iterations >= 1
 

@@ -392,7 +392,7 @@ def test_an_episode_that_is_left_ends_the_simulator():
     for _ in range(3):
         env.rollout(4, lambda td: td.set("action", torch.zeros(1, dtype=torch.float64)))
     env.close()
-    assert CALLS == ["EpisodeAbandoned"] * 3 and threading.active_count() == threads
+    assert CALLS == ["EpisodeAbandoned"] * 3 and threading.active_count() <= threads  # one of before may have ended
 
 
 def within(seconds, call):

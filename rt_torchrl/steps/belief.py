@@ -246,7 +246,12 @@ class Belief:
     def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
         n = twin.plant.n_steps
         repeated = [(flown, self.virtual.repeated(flown.trajectory).exogenous) for flown in self.flown]
-        whole = [pair for pair in repeated if pair[1].shape[1] == n and not self._feeds_back(pair[0])]
+        # State feedback is no function of an observation, and a part of an episode has another cost.
+        whole = [
+            pair
+            for pair in repeated
+            if pair[1].shape[1] == n and not isinstance(self._policies[pair[0].role], StateFeedback)
+        ]
         if not whole:
             return None
         if twin not in self._twins:
@@ -256,10 +261,6 @@ class Belief:
         policies = [self.policy_of(flown) for flown, _ in whole]
         replays = AnchoredReplays(self._twins[twin], records, inputs, costs, policies)
         return Anchors(replays, self._growth(replays.latest(ANCHORS), policies[-ANCHORS:]))
-
-    def _feeds_back(self, flown: Flown) -> bool:
-        """Whether state feedback flew an episode, which is no function of an observation."""
-        return isinstance(self._policies[flown.role], StateFeedback)
 
     def _growth(self, replays: AnchoredReplays, policies: Sequence[nn.Module]) -> float:
         """The most likely v, by how well each episode predicts the corrections of the others."""

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
-from rt_torchrl.plants.shapes import Action, Costs, Hidden, Input, Inputs, Starts, State, Time
+from rt_torchrl.plants.shapes import Action, Costs, Input, Inputs, Starts, State, Time
 from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -36,62 +36,52 @@ OBSERVATIONS = 64
 
 
 class _Driven(Extension):
-    """A plant with further inputs, after its own, which only the map of an interval reads.
+    """A plant with further inputs, after its own, which only the map of an interval reads; one for each reading.
 
     Args:
         base: the plant of a twin.
-        symbol: symbol of the further inputs, one for each state that sensors read.
     """
 
     own_scheme = True
     """What is added to an interval as a whole has no vector field."""
+    further = ""
+    """What the further inputs are."""
 
-    def __init__(self, base: Plant, symbol: str):
+    def __init__(self, base: Plant):
         super().__init__(base, [])
         self.count = len(base.inputs)
-        added = [Signal(symbol=symbol, name=f"{symbol}_{signal.name}", unit=signal.unit) for signal in base.readings]
+        added = [Signal(symbol="e", name=f"{self.further}_{signal.name}", unit=signal.unit) for signal in base.readings]
         self.inputs = (*base.inputs, *added)
 
-    def divided(self, exogenous: Input) -> tuple[Input, Float[Tensor, "*batch n_r"]]:
-        """The inputs of the plant, and the further ones."""
-        return exogenous[..., : self.count], exogenous[..., self.count :]
-
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
-        return self.base.vector_field(t, state, action, self.divided(exogenous)[0], closure)
+        return self.base.vector_field(t, state, action, exogenous[..., : self.count], closure)
 
     def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
         if "exogenous" in given:
-            given["exogenous"] = self.divided(given["exogenous"])[0]
+            given["exogenous"] = given["exogenous"][..., : self.count]
         return super().ask(part, method, given)
 
 
 class Anchored(_Driven):
     """A plant whose interval ends the increments e further; its inputs are those of the plant, and e."""
 
-    def __init__(self, base: Plant):
-        super().__init__(base, "increment")
+    further = "increment"
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
-        met, increments = self.divided(exogenous)
-        end = self.base.advance(t, state, applied, met, closure)
-        n = increments.shape[-1]
+        met, increments = exogenous[..., : self.count], exogenous[..., self.count :]
+        end, n = self.base.advance(t, state, applied, met, closure), increments.shape[-1]
         return torch.cat([end[..., :n] + increments, end[..., n:]], -1)
 
 
 class Followed(_Driven):
     """A plant whose intervals begin with the states that sensors have read; hidden states follow from them."""
 
-    def __init__(self, base: Plant):
-        super().__init__(base, "measured")
+    further = "measured"
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        met, measured = self.divided(exogenous)
-        began = torch.cat([measured, self.hidden(state)], -1)
+        met, measured = exogenous[..., : self.count], exogenous[..., self.count :]
+        began = torch.cat([measured, state[..., measured.shape[-1] :]], -1)
         return self.base.step(t, began, command, met, closure)
-
-    def hidden(self, state: State) -> Hidden:
-        """The states that no sensor reads."""
-        return state[..., len(self.base.readings) :]
 
 
 class AnchoredTwin:
