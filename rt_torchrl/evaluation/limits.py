@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -332,6 +331,8 @@ def by_simplex(unseen: UnseenEpisodes, policy: nn.Module, count: int, *, size: f
         count: greatest number of costs.
         size: size of the first simplex, as a share of each weight.
     """
+    from scipy.optimize import minimize  # here, because the options of a recipe need not wait for it
+
     weights = [weight for weight in policy.parameters() if weight.requires_grad]
     start = parameters_to_vector(weights).detach()
     scale = size * start.abs().clamp_min(0.1)
