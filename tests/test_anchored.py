@@ -16,7 +16,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import UnreadInput
-from rt_torchrl.steps.belief import ANCHORS, LEAST, LENGTH, NOISE, Belief
+from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
 from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import AnchoredReplays, AnchoredTwin
@@ -160,8 +160,10 @@ def virtual_episodes(physics, count=20):
 def test_a_twin_that_has_been_right_keeps_the_word():
     physics = LinearQuadratic()
     belief = belief_of(physics, physics, [(0.5, 0.5), (0.6, 0.5)])
-    assert belief.correction(LinearGain([[2.0, 2.0]])).item() == pytest.approx(0.0, abs=NOISE**2)
-    assert belief._anchors().growth < 200.0 * LEAST
+    assert belief.correction(LinearGain([[2.0, 2.0]])).item() == 0.0 and not belief.contradicted
+    dear = belief.flown[0]._replace(cost=1.1 * belief.flown[0].cost)
+    belief.append(dear.trajectory, "model_based", dear.cost, weights=dear.weights)
+    assert belief.contradicted and belief.correction(LinearGain([[0.5, 0.5]])).item() > 0.03
     assert belief.expected(LinearGain([[0.5, 0.5]]), -4.0) == -4.0
     assert belief.expected(LinearGain([[0.5, 0.5]]), math.inf) == math.inf
 

@@ -14,7 +14,8 @@ with the mean square of the difference of actions, in shares of half their range
 
 with the number n_i of episodes that policies like this one flew, which know the same. The cost that is expected on the
 real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6
-take this one. How well the episodes predict each other chooses v: a twin that has been right keeps the word.
+take this one. How well the episodes predict each other chooses v. A twin that says of all these episodes what they
+cost, within σ, keeps the word.
 """
 
 import copy
@@ -51,8 +52,6 @@ GROWTH = 10.0
 """The v that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
 PRIOR = 2.0
 """Number of episodes that this expectation counts for."""
-LEAST = 1e-6
-"""Least v. A policy that never flew costs nothing more on a right twin: small gains count there."""
 EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration, as a share of half the ranges."""
 DEARER = 5.0
@@ -216,7 +215,7 @@ class Belief:
     def correction(self, policy: nn.Module, *, latest: int = HISTORY) -> Float[Tensor, ""]:
         """The log m + s²/2 of the expected cost over the twin's, differentiable by the policy's weights.
 
-        It is zero before the first whole episode, and for state feedback, which is no function of an observation.
+        It is zero while the twin is right, and for state feedback, which is no function of an observation.
 
         Args:
             policy: the policy.
@@ -234,8 +233,13 @@ class Belief:
         precisions = 1.0 / (alike * (NOISE**2 + anchors.growth * (apart + replays.explored)))
         return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
 
+    @property
+    def contradicted(self) -> bool:
+        """Whether real episodes correct the twin."""
+        return self._anchors() is not None
+
     def _anchors(self) -> "Anchors | None":
-        """The latest whole episodes on the present twin; None without any."""
+        """The latest whole episodes on the present twin; None without any, and while the twin is right."""
         twin = self.virtual.twin
         state = twin.state_dict()
         if self._anchored is None or not equal(state, self._anchored[0]):
@@ -252,7 +256,7 @@ class Belief:
             for pair in repeated
             if pair[1].shape[1] == n and not isinstance(self._policies[pair[0].role], StateFeedback)
         ]
-        if not whole:
+        if not whole or max(abs(d) for d in self.differences() if not math.isnan(d)) <= NOISE:
             return None
         if twin not in self._twins:
             self._twins[twin] = AnchoredTwin(twin)
@@ -274,7 +278,7 @@ class Belief:
         met, others = corrections.diag(), ~torch.eye(len(rows), dtype=torch.bool, device=corrections.device)
         errors = (met.unsqueeze(-1) - corrections)[others].square().clamp(max=DEARER)
         distances = replays.distances()[others]
-        expected = max(LEAST, GROWTH * met.square().mean().item())
+        expected = GROWTH * max(NOISE**2, met.square().mean().item())
 
         def unlikely(log_growth: float) -> float:
             growth = math.exp(log_growth)

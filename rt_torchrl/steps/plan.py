@@ -283,13 +283,14 @@ class MultiStart:
             self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
-        flown = self.belief.best_flown(policy, judged_on) if self.belief.corrects else None
-        recalled = [] if flown is None or flown[1] >= stays or equal(flown[0], present) else [(3, flown[0])]
+        corrected = self.belief.corrects and self.belief.contradicted
+        flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
+        recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < stays else []
         if several or recalled:
             others = self._others(episode, planned_on, flown) if several else recalled
             new = ((number, weights) for number, weights in others if not equal(weights, present))
             best = self._best(best, new, planned_on, judged_on)
-        if flown is not None and flown[1] < best.cost:
+        if flown is not None and corrected and flown[1] < best.cost:
             best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
             self.planner.restart()
