@@ -104,3 +104,18 @@ def test_what_is_not_one_graph_is_found():
     assert re.search(
         r"'autograd' takes the place .*running_cost .*reads the global CONFIG, a dict.*a buffer", configured
     )
+
+
+class Cornered(LinearQuadratic):
+    """A plant whose episodes begin in corners of its laws, where torch has a slope between those of both sides."""
+
+    def draw_initial_state(self, batch, generator):
+        return torch.zeros_like(super().draw_initial_state(batch, generator))
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        friction = 0.1 * state[..., 1:].abs() + 0.3 * state[..., 1:].clamp(min=0.0)
+        return super().vector_field(t, state, action, exogenous, closure) - torch.cat([0.0 * friction, friction], -1)
+
+
+def test_a_corner_is_no_wrong_derivative():
+    check_plant(Cornered())

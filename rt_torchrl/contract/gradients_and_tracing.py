@@ -19,6 +19,8 @@ STEP = 1e-6
 """Step of a difference, as a share of the argument's size; rounding then errs by 1e-10, and curvature by 1e-12."""
 RELATIVE, ABSOLUTE = 1e-5, 1e-6
 """Greatest gap, as a share of the derivative and of the size of the method's value."""
+CORNER, JUMP = 1e-5, 1e-4
+"""Least gap between the slopes of both sides of a corner, and least change of the value, in its size, of a jump."""
 SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exogenous": "inputs"}
 CHECKED = ("vector_field", "step", "running_cost", "terminal_cost", "observe")
 GROWTH = 1.0 + 1e-6
@@ -108,8 +110,8 @@ def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: s
     for k, signal in enumerate(getattr(calls.plant, SIGNALS[argument])):
         direction = torch.zeros_like(value)
         direction[..., k] = 1e-3 + value.detach()[..., k].abs().max()
-        differences, slope = _along(value, direction, measure), (gradient * direction).sum(-1)
-        yield from _verdict(method.name, f"{argument} {signal.name!r}", slope, differences)
+        sides, slope = _along(value, direction, measure), (gradient * direction).sum(-1)
+        yield from _verdict(method.name, f"{argument} {signal.name!r}", slope, _differences(sides, slope))
 
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
@@ -119,7 +121,8 @@ def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.M
     for (name, weight), gradient in zip(weights.items(), _gradients(measure, [*weights.values()]), strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
         direction *= 1e-3 + weight.detach().abs().max()
-        differences, slope = _along(weight, direction, measure).sum(), (gradient * direction).sum()
+        sides, slope = _along(weight, direction, measure).flatten(1).sum(-1), (gradient * direction).sum()
+        differences = _differences(sides, slope)
         violations = [*_verdict(method.name, f"{whose} weight {name!r}", slope, differences)]
         yield from violations
         matters = gradient.any() or differences.any() or id(weight) in dormant
@@ -139,13 +142,23 @@ def _dormant(closure: nn.Module) -> set[int]:
 
 @torch.no_grad()
 def _along(x: Tensor, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
-    """The central difference along a direction of a tensor, which then has its value again, to the bit."""
+    """The differences forwards and backwards along a direction of a tensor, which then has its value again, to the bit.
+
+    They differ where a law has a corner, such as that of a rate limit.
+    """
     kept, ends = x.clone(), []
-    for sign in (1.0, -1.0):
+    for sign in (1.0, 0.0, -1.0):
         x.copy_(kept + sign * STEP * direction)
         ends.append(measure())
     x.copy_(kept)
-    return (ends[0] - ends[1]) / (2.0 * STEP)
+    return torch.stack([ends[0] - ends[1], ends[1] - ends[2]]) / STEP
+
+
+def _differences(sides: Tensor, slope: Tensor) -> Tensor:
+    """The central difference or, in a corner, what lies nearest to a slope between the differences of both sides."""
+    low, high = sides.amin(0), sides.amax(0)
+    corner = ((high - low) > CORNER * (1.0 + slope.abs())) & ((high - low) * STEP < JUMP)
+    return torch.where(corner, torch.minimum(torch.maximum(slope, low), high), sides.mean(0))
 
 
 def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[], Tensor]:
