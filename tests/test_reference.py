@@ -46,7 +46,8 @@ def test_a_run_states_the_limit_beside_the_optimum_of_its_class(tmp_path, config
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())["summary"]["reference"]
     assert found["better_over_reference"] >= 1.0 - 1e-9
     if config is RunConfig:
-        assert set(found) == {"J_a", "J_a_of_each_start", "better_over_reference"}
+        assert set(found) == {"J_a", "J_a_by_gradients", "J_a_of_each_start", "better_over_reference"}
+        assert found["J_a"] <= found["J_a_by_gradients"]
         assert "limit on" not in results_table(metrics)
         return
     best, unseen = found["limit"], UnseenEpisodes(plant, 4)

@@ -15,7 +15,7 @@ with the mean square of the difference of actions, in shares of half their range
 with the number n_i of episodes that policies like this one flew, which know the same. The cost that is expected on the
 real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6
 take this one. How well the episodes predict each other chooses v. A twin that says of all these episodes what they
-cost, within σ, keeps the word.
+cost, within σ and what exploration explains, keeps the word.
 """
 
 import copy
@@ -256,7 +256,9 @@ class Belief:
             for pair in repeated
             if pair[1].shape[1] == n and not isinstance(self._policies[pair[0].role], StateFeedback)
         ]
-        if not whole or max(abs(d) for d in self.differences() if not math.isnan(d)) <= NOISE:
+        pairs = zip(self.differences(), self.flown, strict=True)
+        beyond = [abs(d) - 2.0 * EXPLORED * flown.exploration for d, flown in pairs if not math.isnan(d)]
+        if not whole or max(beyond) <= NOISE:
             return None
         if twin not in self._twins:
             self._twins[twin] = AnchoredTwin(twin)
