@@ -24,7 +24,7 @@ import torch
 
 from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
 from rt_torchrl.atomic_file import make_folder, write_results
-from rt_torchrl.evaluation.limits import FOR_PERCEPTRONS, exact_optimum, few_starts, limit
+from rt_torchrl.evaluation.limits import exact_optimum, few_starts, limit
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.interruption import Interrupted, termination_as_interrupt
 from rt_torchrl.options import AtLeastOne, Count
@@ -278,8 +278,7 @@ class Yardstick:
 
     def _costs(self, config: RunConfig, episodes: UnseenEpisodes, make_policy: Callable) -> dict[str, Any]:
         if self.kind == "optimum":
-            effort = (FOR_PERCEPTRONS if config.policy == "mlp" else {}) | self.effort
-            best = exact_optimum(episodes, make_policy, **effort)
+            best = exact_optimum(episodes, make_policy, **self.effort)
             return {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         if (known := config.limit()) is None:
             raise ValueError(f"recipe={self.recipe} does not say how the limit is computed; override Config.limit().")

@@ -45,6 +45,21 @@ def test_the_reference_of_a_plant_with_stiction_is_that_of_a_grid_and_not_of_gra
     assert found.cost < 0.99 * found.by_gradients
 
 
+def test_the_effort_of_the_reference_follows_the_number_of_weights():
+    """Whatever a recipe calls it, a perceptron takes more gradients than a gain."""
+    unseen = UnseenEpisodes(LinearQuadratic(horizon=0.4), 2)
+
+    def small_perceptron(generator):
+        return SaturatedMLP(2, unseen.plant.actions, hidden=(6,), generator=generator)
+
+    for make_policy, numbers in (
+        (random_gain, {"approach": 0, "iterations": 80, "polish": 20}),
+        (small_perceptron, {"approach": 600, "iterations": 300, "polish": 150}),
+    ):
+        given = exact_optimum(unseen, make_policy, starts=1, few=2, **numbers)
+        assert exact_optimum(unseen, make_policy, starts=1, few=2)[2:] == given[2:]
+
+
 class OnlyReal(RealController):
     """A controller that nobody flies here."""
 

@@ -247,10 +247,10 @@ def untrained_costs(
 TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
 FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
 """Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
-
-
 DIRECT = 20
 """Greatest number of weights that are also searched without gradients."""
+FOR_FEW_WEIGHTS = {"approach": 0, "iterations": 80, "polish": 20}
+"""Numbers of gradients of a policy with no more weights."""
 ENOUGH, POLISH = 80, 20
 """Numbers of costs for each weight of that search, on a few episodes and on all."""
 
@@ -272,10 +272,10 @@ def exact_optimum(
     make_policy: Callable[[torch.Generator], nn.Module],
     *,
     starts: int = 3,
-    iterations: int = 80,
+    iterations: int | None = None,
     few: int = 10,
-    polish: int = 20,
-    approach: int = 0,
+    polish: int | None = None,
+    approach: int | None = None,
     seed: int = UNSEEN_SEED,
 ) -> Optimum:
     """The best policy of a class, found on the *true* plant and on the unseen episodes themselves.
@@ -289,11 +289,12 @@ def exact_optimum(
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
         starts: number of random initial policies.
-        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes.
+        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes; by default 80, or 300 for more
+            than twenty weights.
         few: number of episodes on which every start descends.
-        polish: gradients of the best start, on all episodes.
-        approach: gradients of Adam from each start before those of L-BFGS. Perceptrons need some 600; L-BFGS alone
-            takes them to the next poor minimum.
+        polish: gradients of the best start, on all episodes; by default 20, or 150 for more than twenty weights.
+        approach: gradients of Adam from each start before those of L-BFGS; by default none, or 600 for more than twenty
+            weights. L-BFGS alone takes perceptrons to the next poor minimum.
         seed: seed of the initial weights.
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
@@ -310,11 +311,14 @@ def exact_optimum(
         return Descent(policy, TO_THE_END).run(cost, steps).best
 
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
-    costs = [descend(policy, few, iterations, approaching=approach) for policy in policies]
+    count = sum(weight.numel() for weight in policies[0].parameters() if weight.requires_grad)
+    usual = FOR_PERCEPTRONS if count > DIRECT else FOR_FEW_WEIGHTS
+    asked = {"approach": approach, "iterations": iterations, "polish": polish}
+    effort = {name: usual[name] if number is None else number for name, number in asked.items()}
+    costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     best, *others = (policies[k] for k in sorted(range(starts), key=costs.__getitem__))
-    by_gradients = descend(best, len(unseen.initial_state), polish)
+    by_gradients = descend(best, len(unseen.initial_state), effort["polish"])
     found = [(by_gradients, best)]
-    count = sum(weight.numel() for weight in best.parameters() if weight.requires_grad)
     if 0 < count <= DIRECT:
         for policy in (copy.deepcopy(best), *others[:1]):
             by_simplex(unseen.first(few), policy, count * ENOUGH, size=0.3)

@@ -13,15 +13,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.checks import rms_error, visited_features
-from rt_torchrl.evaluation.limits import (
-    FOR_PERCEPTRONS,
-    Contender,
-    LimitConfig,
-    exact_optimum,
-    few_starts,
-    limit,
-    predictive,
-)
+from rt_torchrl.evaluation.limits import Contender, LimitConfig, exact_optimum, few_starts, limit, predictive
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
@@ -299,7 +291,7 @@ def reference_entry(
     """
     if not config.reference:
         return {}
-    optimum = exact_optimum(unseen, make_policy, **(FOR_PERCEPTRONS if config.policy == "mlp" else {}))
+    optimum = exact_optimum(unseen, make_policy)
     known, cost = config.limit() if config.limit_episodes else None, unseen.control_costs(better).mean().item()
     compared = {
         "J_a": optimum.cost,
