@@ -1,8 +1,6 @@
 """Train a plant's twin on a recorded log, without control: ``identify.py log.csv --plant wind_turbine``."""
 
 import dataclasses
-import math
-from collections.abc import Iterable
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +14,7 @@ import torch
 import tyro
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, configuration, main_of, read_log
-from rt_torchrl.atomic_file import make_folder, new_folder, write_results
+from rt_torchrl.atomic_file import finite, make_folder, new_folder, write_results
 from rt_torchrl.fit.least_squares import Identified, identify
 from rt_torchrl.fit.log import Column, checked, pandas
 from rt_torchrl.fit.resampling import (
@@ -179,21 +177,25 @@ def metrics_of(found: Identified) -> dict[str, Any]:
     summary: dict[str, Any] = {"iterations": estimate.iterations, "prior": estimate.stiffness}
     summary["segment"] = estimate.segment
     for side in ("training", "held_out"):
-        before, after = (_numbers(judged.rms.tolist()) for judged in getattr(found, side))
+        before, after = (judged.rms.tolist() for judged in getattr(found, side))
         each = zip(names, units, before, after, strict=True)
         summary[side] = {"rms": {name: {"unit": unit, "before": b, "after": a} for name, unit, b, a in each}}
-    summary["autocorrelation"] = dict(zip(names, _numbers(found.autocorrelation.tolist()), strict=True))
+    summary["autocorrelation"] = dict(zip(names, found.autocorrelation.tolist(), strict=True))
     summary["noise"], summary["bias"] = estimate.noise, estimate.biases
     errors, intervals = uncertainty.standard_errors(), uncertainty.intervals()
     summary["weights"] = {
-        name: {"before": estimate.before[name], "after": value, "interval": _numbers(intervals[name])}
-        | dict(zip(["standard_error"], _numbers([errors[name]]), strict=True))
+        name: {
+            "before": estimate.before[name],
+            "after": value,
+            "interval": intervals[name],
+            "standard_error": errors[name],
+        }
         for name, value in estimate.after.items()
     }
-    starts = zip(estimate.initial.tolist(), map(_numbers, uncertainty.initial_errors().tolist()), strict=True)
+    starts = zip(estimate.initial.tolist(), uncertainty.initial_errors().tolist(), strict=True)
     named = [state.name for state in states]
     summary["initial_states"] = [dict(zip(named, map(list, zip(*pair, strict=True)), strict=True)) for pair in starts]
-    return summary | {"warnings": estimate.warnings()}
+    return finite(summary | {"warnings": estimate.warnings()})
 
 
 def held_back(plant: Plant, segments: list[Trajectory]) -> dict[str, float]:
@@ -244,11 +246,6 @@ def table(metrics: dict[str, Any]) -> str:
         if share
     ]
     return "\n\n".join([*shown, "\n".join(notes)])
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    """Finite numbers; None in the place of others, which JSON has not."""
-    return [value if math.isfinite(value) else None for value in values]
 
 
 if __name__ == "__main__":

@@ -37,7 +37,8 @@ Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 class Config:
     """Fly one episode of a plant and write the log that a data logger would write.
 
-    The classical controller of a plant of this library acts, and a policy with random first weights on another plant.
+    The classical controller of turbine, drone and tank acts, also where FILE.py:NAME or package.module:NAME gives the
+    plant; on any other plant a policy with random first weights does.
 
     Args:
         log: log file to write, CSV or Parquet.
@@ -69,10 +70,11 @@ class Config:
 def main(config: Config) -> None:
     plant = plant_class(config.plant)(**({} if config.horizon is None else {"horizon": config.horizon}))
     generator = torch.Generator().manual_seed(config.seed)
-    known = CONTROLLERS.get(config.plant)
+    known = CONTROLLERS.get(plant.name)
     law = known(plant).act if known else policy_law(plant, plant.make_policy(generator))
     log = recorded(plant, law, generator, jitter=0.0 if plant.own_scheme else JITTER, noise=config.noise)
-    log = log.chosen(np.abs(log.times / log.times[-1] - 0.5 - 0.5 * config.gap) > 0.5 * config.gap)
+    share = log.times / log.times[-1]
+    log = log.chosen((share <= 0.5) | (share > 0.5 + config.gap))
     log = log.without([s.name for s in logged_states(plant) if config.states and s.name not in config.states])
     log.write(config.log)
     print(f"{len(log.times)} rows of plant {plant.name!r} in {config.log}: {', '.join(log.columns)}")
