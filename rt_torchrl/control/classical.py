@@ -72,10 +72,6 @@ class ClassicalController(nn.Module, ABC):
         """The gains in the order and the units of ``gain_units``, for :meth:`law`."""
         return self.log_gains.exp()
 
-    def named_gains(self) -> dict[str, float]:
-        """The gains by name, for reports; numbers that :meth:`law` reads could not become machine code."""
-        return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
-
     def first_memory(self, state: State) -> Memory:
         """Memory at the start of an episode; zeros by default."""
         return state.new_zeros(len(state), self.memory_size)
