@@ -3,6 +3,7 @@
 import ctypes
 import json
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from c_build import needs_compiler
 
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export import c_file
 from rt_torchrl.export.fmu import export_policy_fmu, export_twin_fmu
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run import Run
@@ -210,6 +212,17 @@ def test_what_does_not_fit_an_fmu_is_refused(turbine, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
+
+
+def test_an_fmu_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
+    """The work would say more: that the policy does not fit the plant, and that nothing was checked."""
+    with pytest.raises(ValueError, match="must end in .fmu"):
+        export_policy_fmu(torch.nn.Identity(), tmp_path / "policy.zip", PLANT)
+    monkeypatch.setattr(c_file, "COMPILERS", ("no_such_compiler",))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match="there is no C compiler here; install one"):
+            export_twin_fmu(PLANT.closure, tmp_path / "twin.fmu", PLANT)
 
 
 # A whole training whose real system is an FMU, against one whose real system is the plant.

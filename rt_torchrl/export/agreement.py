@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ TOLERANCE = 1e-6
 OBSERVATIONS = 1000
 SEED = 20_250_131
 """Seed of the observations, which is the same for every export and is used in no training."""
+Module = TypeVar("Module", bound=nn.Module)
 
 
 def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED) -> Float[Tensor, "{count} n_o"]:
@@ -40,14 +42,22 @@ def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED)
     return torch.stack(columns, -1)
 
 
+def frozen(module: Module) -> Module:
+    """A copy of a module on the CPU, in evaluation mode, whose weights share no memory and take no gradients."""
+    module = copy.deepcopy(module).cpu().eval().requires_grad_(False)
+    for weight in module.parameters():
+        weight.data = weight.data.clone()
+    return module
+
+
 def detached(policy: nn.Module, plant: Plant) -> nn.Module:
-    """A copy of a policy on the CPU, in evaluation mode and without gradients, after a check that it fits the plant.
+    """A copy of a policy from :func:`frozen`, after a check that it fits the plant.
 
     Raises:
         ValueError: if the policy does not map the plant's observations to its actions in double precision, or if a call
             changes its buffers.
     """
-    policy = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
+    policy = frozen(policy)
     name, n_o, n_a = type(policy).__name__, len(plant.observations), len(plant.actions)
     observations, before = sample_observations(plant.observations, 3), copy.deepcopy(dict(policy.named_buffers()))
     try:

@@ -15,7 +15,6 @@ from rt_torchrl.export.c_file import (
     add_function,
     c_array,
     called,
-    frozen,
     require_names,
     signal_table,
     source_of,
@@ -76,7 +75,7 @@ def export_controller(
     """
     name = f"{plant.name}_controller" if name is None else name
     path = require_names(path, name)
-    written = CController(Controller(plant, frozen(detached(policy, plant))), name)
+    written = CController(Controller(plant, detached(policy, plant)), name)
     return write_c(path, name, written.comment(), written.declarations(), written.source(), written.fly)
 
 

@@ -1,7 +1,6 @@
 """Functions of tensors as a C99 file with its header: traced, compiled, called, and written after a comparison."""
 
 import contextlib
-import copy
 import ctypes
 import math
 import re
@@ -26,7 +25,6 @@ from rt_torchrl.programs.tracer import Tracer
 COMPILERS = ("cc", "gcc", "clang")
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
 REMEDY = "Write it with arithmetic of torch in float64; the formats pt2 and onnx take more of a policy than C does."
-Module = TypeVar("Module", bound=nn.Module)
 Result = TypeVar("Result")
 
 
@@ -48,14 +46,6 @@ class TracedFunction(NamedTuple):
         return {o.attributes[1] for o in operations if o.name == "input" and o.attributes[0] == name}
 
 
-def frozen(module: Module) -> Module:
-    """A copy of a module on the CPU, in evaluation mode, whose weights share no memory and take no gradients."""
-    module = copy.deepcopy(module).cpu().eval().requires_grad_(False)
-    for weight in module.parameters():
-        weight.data = weight.data.clone()
-    return module
-
-
 def traced(
     what: str,
     function: Callable[..., Mapping[str, Tensor]],
@@ -70,7 +60,7 @@ def traced(
         what: name of the function, for messages.
         function: function of tensors that returns tensors by name.
         arguments: example of every argument, with one realisation.
-        module: module from :func:`frozen` whose weights the C file holds.
+        module: module from :func:`~rt_torchrl.export.agreement.frozen` whose weights the C file holds.
         prepare: called with the tracer before the function is.
 
     Raises:

@@ -8,11 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.export.agreement import SEED, detached, require_close, require_policy, sample_observations, sizes
+from rt_torchrl.export.agreement import (
+    SEED,
+    detached,
+    frozen,
+    require_close,
+    require_policy,
+    sample_observations,
+    sizes,
+)
 from rt_torchrl.export.c_file import (
     add_function,
     answers,
-    frozen,
     require_names,
     signal_table,
     source_of,
@@ -55,7 +62,7 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
             message names the line), the file does not compile, or the function does not agree with the policy.
     """
     name = f"{plant.name}_policy" if function is None else function
-    path, policy = require_names(path, name), frozen(detached(policy, plant))
+    path, policy = require_names(path, name), detached(policy, plant)
     source = source_of("policy", policy)
     example = {"observation": sample_observations(plant.observations, 1)}
     what = f"policy {type(policy).__name__}"

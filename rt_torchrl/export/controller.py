@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.export.c_file import frozen
+from rt_torchrl.export.agreement import frozen
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import differences
 

@@ -41,6 +41,7 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_c` refuses the
             policy.
     """
+    cc = _compiler_for(path)
     name, inputs = f"{plant.name}_policy", [("observation", signal) for signal in plant.observations]
     outputs = [("action", signal) for signal in plant.actions]
     values = [0.0] * (len(inputs) + len(outputs))
@@ -48,7 +49,7 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
         source = Path(folder, "policy.c")
         export_c(policy, source, plant, function=name)
         calls = {"@OUTPUT@": f"{name}(v, v + {len(inputs)});", "@STEP@": "(void)t;"}
-        _write(path, name, plant.dt, inputs, outputs, values, source, calls)
+        _write(path, cc, name, plant.dt, inputs, outputs, values, source, calls)
 
 
 def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0) -> None:
@@ -67,6 +68,7 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_twin` refuses the
             twin.
     """
+    cc = _compiler_for(path)
     name, n_a = f"{plant.name}_twin", len(plant.actions)
     inputs = [("command", s) for s in plant.actions] + [("exogenous", s) for s in plant.inputs]
     n, outputs = len(inputs), [("state", signal) for signal in plant.states]
@@ -75,11 +77,26 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
         source = Path(folder, "twin.c")
         export_twin(closure, source, plant, name=name)
         calls = {"@OUTPUT@": "(void)v;", "@STEP@": f"{name}_step(t, v + {n}, v, v + {n_a}, v + {n});"}
-        _write(path, name, plant.dt, inputs, outputs, values, source, calls)
+        _write(path, cc, name, plant.dt, inputs, outputs, values, source, calls)
+
+
+def _compiler_for(path: Path | str) -> str:
+    """The compiler for the FMU that is to be written, before the work that it is for.
+
+    Raises:
+        ValueError: if the path does not end in ``.fmu``, or there is no C compiler.
+    """
+    if Path(path).suffix != ".fmu":
+        raise ValueError(f"path={path} of an FMU must end in .fmu.")
+    cc = compiler()
+    if cc is None:
+        raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
+    return cc
 
 
 def _write(
     path: Path | str,
+    cc: str,
     name: str,
     dt: float,
     inputs: Variables,
@@ -88,11 +105,7 @@ def _write(
     source: Path,
     calls: dict[str, str],
 ) -> None:
-    found, token, content = compiler(), f"{{{uuid4()}}}", io.BytesIO()
-    if Path(path).suffix != ".fmu":
-        raise ValueError(f"path={path} of an FMU must end in .fmu.")
-    if found is None:
-        raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
+    token, content = f"{{{uuid4()}}}", io.BytesIO()
     text = files("rt_torchrl.export").joinpath("fmu.c").read_text(encoding="utf-8")
     words = {"@HEADER@": source.with_suffix(".h").name, "@COUNT@": str(len(values)), "@GUID@": token}
     words |= {"@INTERVAL@": repr(dt), "@VALUES@": ", ".join(map(repr, values))}
@@ -101,7 +114,7 @@ def _write(
     # One unit of translation, so that one call of the compiler makes the library.
     wrapper = source.with_name(f"{name}_fmu.c")
     wrapper.write_text(text + source.read_text(encoding="utf-8"), encoding="utf-8")
-    library = compile_c(found, wrapper)
+    library = compile_c(cc, wrapper)
     folder = f"{SYSTEMS.get(sys.platform, 'linux')}{platform.architecture()[0].removesuffix('bit')}"
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as fmu:
         fmu.writestr("modelDescription.xml", description(name, token, dt, inputs, outputs, values))
