@@ -202,6 +202,61 @@ def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error
     system.close()
 
 
+def test_a_client_that_cannot_be_made_now_is_a_lost_connection_and_is_made_at_the_next_attempt(server):
+    """To make a client may ask the server, for its certificate for instance, and that takes longer than an answer."""
+    from asyncua.sync import Client
+
+    failures = [ConnectionRefusedError("nobody listens"), server.ua.UaError("no such policy"), TimeoutError()]
+
+    def client(tloop):
+        if failures:
+            raise failures.pop(0)
+        tloop.post(asyncio.sleep(0.3))
+        return Client(server.url, tloop=tloop)
+
+    link = OpcUaLink(client, {"position": "ns=2;s=position"}, {"double": "ns=2;s=double"}, timeout=0.2)
+    for kind in ("ConnectionRefusedError: nobody listens", "UaError: no such policy", "TimeoutError"):
+        with pytest.raises(LinkLostError, match=kind):
+            link.connect()
+    try:
+        for _ in range(2):
+            link.connect()
+            assert link.read() == {"position": 0.5}
+    finally:
+        link.close()
+
+
+class Failed(Line):
+    """A line that is cut once; the next attempt to connect fails at a mistake, and those after it do not."""
+
+    cut = True
+
+    def write(self, values):
+        if self.cut:
+            self.cut = False
+            raise LinkLostError("cut")
+        super().write(values)
+
+    def connect(self):
+        super().connect()
+        if self.connections == 2:
+            raise KeyError("cert.pem")
+
+
+def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_next_reset_connects():
+    line = Failed(Time(), 0.1)
+    env = client_of(line)
+    row, action = env.reset(), torch.tensor([1.0]).double()
+    row = env.step(row.set("action", action))["next"]
+    if env._mender is not None:
+        env._mender.join()
+    with pytest.raises(KeyError, match=r"cert\.pem"):
+        env.step(row.set("action", action))
+    row = env.reset()
+    assert line.connections == 3 and env.step(row.set("action", action))["next", "state"].isfinite().all()
+    env.close()
+
+
 def modbus_server(addresses):
     """A Modbus server whose holding registers are these; gives its port and the function that ends it."""
     pytest.importorskip("pymodbus")

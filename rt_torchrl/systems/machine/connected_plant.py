@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.systems.operation.operator import Pace
 
@@ -24,6 +25,8 @@ TOLERATED = 4
 """Number of late answers in a row after which a connection counts as lost."""
 AGAIN = 0.05
 """Time between two attempts to connect [s]."""
+LONGEST = 60.0
+"""Longest time of an answer for which any control loop waits [s]."""
 
 
 class LinkLostError(OSError):
@@ -39,6 +42,17 @@ class RefusedRequestError(ValueError):
 
     Another attempt would be refused as well; tags, types or rights must be mended.
     """
+
+
+def require_timeout(timeout: float) -> None:
+    """Refuse a longest time of an answer [s] that no control loop waits for.
+
+    Raises:
+        ValueError: if it is not positive, or longer than ``LONGEST``.
+    """
+    require_range("timeout", timeout, 0.0, LONGEST, unit="s", of="the link")
+    if timeout == 0.0:
+        raise ValueError(f"timeout={timeout} s of the link must be positive.")
 
 
 @runtime_checkable
@@ -147,7 +161,7 @@ class ConnectedPlant(EnvBase):
         self._sample, self._connected, self._closing = -math.inf, False, False
         self.reasons: dict[str, str] = {}
         self._lost = ""  # why the last request failed
-        self._refused: RefusedRequestError | None = None  # what the plant has refused beside the control loop
+        self._refused: Exception | None = None  # what the plant has refused, or the link has failed at, beside the loop
         self._mender: threading.Thread | None = None
         self._lock = threading.Lock()  # connection and mender change together
         double = {"dtype": torch.float64}
@@ -187,7 +201,7 @@ class ConnectedPlant(EnvBase):
         raise ValueError(f"the plant has not answered for patience={self._patience:g} s{why}")
 
     def _require_not_refused(self) -> None:
-        """Raise in the control loop what the plant has refused beside it."""
+        """Raise in the control loop what has ended the attempts to connect beside it."""
         refused, self._refused = self._refused, None
         if refused is not None:
             raise refused
@@ -286,12 +300,12 @@ class ConnectedPlant(EnvBase):
             try:
                 self.link.connect()
                 connected = True
-            except RefusedRequestError as error:
-                self._refused = error  # which the control loop raises
-                break
             except LinkLostError as error:
                 self._lost = str(error)
                 time.sleep(AGAIN)
+            except Exception as error:  # what the plant refuses, or an error of the link: the control loop raises it
+                self._refused = error
+                break
         # Together: a loss right after a new connection finds no mender, and starts the next one.
         with self._lock:
             self._connected, self._mender = connected, None

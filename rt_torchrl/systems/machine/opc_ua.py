@@ -7,22 +7,24 @@ import math
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
-from rt_torchrl.options import require_number, require_range
-from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
+import torch
+
+from rt_torchrl.systems.machine.connected_plant import (
+    LateAnswerError,
+    LinkLostError,
+    RefusedRequestError,
+    require_timeout,
+)
 
 Result = TypeVar("Result")
 CONNECT = 4.0
 """Longest time of an attempt to connect [s]."""
-LONGEST = 60.0
-"""Longest time of an answer for which any control loop waits [s]."""
 WHOLE = {
     f"{sign}Int{bits}": (0 if sign else -(2 ** (bits - 1)), 2 ** (bits - (not sign)) - 1)
     for sign in ("", "U")
     for bits in (16, 32, 64)
 } | {"SByte": (-(2**7), 2**7 - 1), "Byte": (0, 2**8 - 1)}
 """Least and greatest number of each type of whole numbers."""
-SINGLE = 3.4028234663852886e38
-"""Greatest number in single precision."""
 PASSING = frozenset(
     {
         *("BadNoCommunication", "BadCommunicationError", "BadNotConnected", "BadServerNotConnected", "BadTimeout"),
@@ -59,10 +61,7 @@ class OpcUaLink:
             import asyncua.sync
         except ImportError as error:
             raise ValueError("OPC UA needs asyncua: install the extra, pip install 'rt_torchrl[machine]'.") from error
-        require_number("timeout", timeout)
-        if not timeout > 0.0:
-            raise ValueError(f"timeout={timeout} s of the link must be positive.")
-        require_range("timeout", timeout, 0.0, LONGEST, unit="s", of="the link")
+        require_timeout(timeout)
         self._ua: Any = asyncua.ua
         self._thread, self._make_client = asyncua.sync.ThreadLoop, client
         self._read, self._written, self.timeout = dict(read), dict(written), timeout
@@ -77,7 +76,11 @@ class OpcUaLink:
             self._loop.daemon = True  # a program that ends by an error does not wait for it
             self._loop.start()
         self._disconnect()
-        self._client, self._broken = self._make_client(tloop=self._loop), False
+        self._loop.timeout = CONNECT  # of what is asked of the server to make a client, such as its certificate
+        try:
+            self._client, self._broken = self._make_client(tloop=self._loop), False
+        except (OSError, self._ua.UaError, concurrent.futures.TimeoutError) as error:
+            raise LinkLostError(f"the OPC UA client cannot be made: {type(error).__name__}: {error}") from error
         client = self._client.aio_obj
         self.url = client.server_url.geturl()
         try:
@@ -129,7 +132,7 @@ class OpcUaLink:
                     f"{where}, which takes whole numbers from {low} to {high}; give the machine a node of type Double."
                 )
             return self._ua.Variant(round(value), kind)
-        if kind.name == "Float" and math.isfinite(value) and abs(value) > SINGLE:
+        if kind.name == "Float" and math.isfinite(value) and abs(value) > torch.finfo(torch.float32).max:
             raise RefusedRequestError(f"{where}.")
         return self._ua.Variant(float(value), kind)
 
