@@ -257,8 +257,13 @@ def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_ne
     env.close()
 
 
-def modbus_server(addresses):
-    """A Modbus server whose holding registers are these; gives its port and the function that ends it."""
+def modbus_server(addresses, inputs=None):
+    """A Modbus server; gives its port and the function that ends it.
+
+    Args:
+        addresses: first address and number of its holding registers, which hold zeros.
+        inputs: address and number of each input register; None for one table that holds all.
+    """
     pytest.importorskip("pymodbus")
     from pymodbus import simulator
     from pymodbus.server import ModbusTcpServer
@@ -270,6 +275,12 @@ def modbus_server(addresses):
             simulator.SimData(first, values=[0] * count, datatype=simulator.DataType.REGISTERS)
             for first, count in addresses
         ]
+        if inputs is not None:
+            bits = [simulator.SimData(0, values=False, datatype=simulator.DataType.BITS)]
+            words = [
+                simulator.SimData(first, values=word, datatype=simulator.DataType.REGISTERS) for first, word in inputs
+            ]
+            registers = (bits, bits, registers, words)
         device = simulator.SimDevice(id=1, simdata=registers)
         running = ModbusTcpServer(device, address=("127.0.0.1", port))
         await running.serve_forever(background=True)
@@ -328,6 +339,24 @@ def test_registers_have_a_type_a_scale_and_a_word_order():
         for values, tag in (({"valve": -0.5, "count": 0.0}, "valve"), ({"valve": 0.5, "count": 0.5}, "count")):
             with pytest.raises(RefusedRequestError, match=f"'{tag}' = {values[tag]:g} does not fit Register"):
                 link.write(values)
+    finally:
+        link.close()
+        end()
+
+
+def test_input_registers_are_read_in_one_request_of_their_own_table():
+    """Function 4 of the standard, and not 3: the server holds other numbers in its holding registers."""
+    port, end = modbus_server([(0, 8)], inputs=[(10, 0xFFFF - 122), (11, 0x4048), (12, 0xF5C3)])
+    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
+    tags = {"flow": Register(11, "float32", table="input"), "level": Register(10, "int16", scale=0.1, table="input")}
+    link, requests = ModbusLink(client, tags, {"valve": Register(0)}), []
+    client.read_input_registers = lambda first, read=client.read_input_registers, **options: (
+        requests.append((first, options["count"])) or read(first, **options)
+    )
+    try:
+        link.connect()
+        assert link.read() == {"flow": pytest.approx(3.14, rel=1e-7), "level": pytest.approx(-12.3)}
+        assert requests == [(10, 3)]
     finally:
         link.close()
         end()

@@ -204,12 +204,27 @@ def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
         ({"read": {"a": Register(0), "b": Register(200)}}, "read spans 204 registers from 0 on"),
         ({"written": {"a": Register(0), "b": Register(8)}}, "one behind the other"),
         ({"written": {"a": Register(0, table="input")}}, "holding registers"),
+        ({"read": {"a": Register(0), "b": Register(4, table="input")}}, "tables holding and input, and one request"),
     ],
 )
 def test_registers_that_no_request_takes_are_refused(registers, message):
     given = {"read": {"a": Register(0)}, "written": {"b": Register(4)}, **registers}
     with pytest.raises(ValueError, match=message):
         ModbusLink(None, **given)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "retries=3 of the client must be 0"),
+        ({"retries": 0, "timeout": 80.0}, "timeout=80 s of the link must lie in 0 to 60 s.*1 ms is 0.001 s"),
+        ({"retries": 0, "timeout": 0.0}, "timeout=0.0 s of the link must be positive"),
+    ],
+)
+def test_a_modbus_client_that_would_hold_the_control_loop_is_refused(options, message):
+    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", **options)
+    with pytest.raises(ValueError, match=message):
+        ModbusLink(client, {"a": Register(0)}, {"b": Register(4)})
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -6,7 +6,12 @@ from dataclasses import field
 from typing import Any, Literal
 
 from rt_torchrl.options import Count, configuration
-from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
+from rt_torchrl.systems.machine.connected_plant import (
+    LateAnswerError,
+    LinkLostError,
+    RefusedRequestError,
+    require_timeout,
+)
 
 WIDTHS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
 """Number of registers of each type of numbers."""
@@ -61,21 +66,24 @@ class ModbusLink:
     Args:
         client: client of pymodbus, such as ``ModbusTcpClient(host, timeout=0.02, retries=0)``. Its answers must come
             within a fraction of the control period.
-        read: registers of the tags that are read; those of one table lie beside each other.
+        read: registers of the tags that are read, beside each other in one table: one request takes readings of one
+            moment.
         written: holding registers of the tags that are written, one behind the other.
         device: number of the device behind the server.
 
     Raises:
-        ValueError: if the registers do not fit one request, or the written ones have gaps, which a request would
-            overwrite.
+        ValueError: if the registers do not fit one request, the written ones have gaps, which a request would
+            overwrite, or the client tries again by itself or waits longer than any control loop.
     """
 
     def __init__(self, client: Any, read: Mapping[str, Register], written: Mapping[str, Register], *, device: int = 1):
-        self._client, self._device, self._joined = client, device, False
-        tables = {register.table for register in read.values()}
-        self._read = {table: {tag: one for tag, one in read.items() if one.table == table} for table in tables}
-        for registers in self._read.values() or [{}]:
-            _require_block("read", registers)
+        _require_block("read", read)
+        tables = sorted({register.table for register in read.values()})
+        if len(tables) > 1:
+            raise ValueError(
+                f"read={dict(read)} has registers of the tables {' and '.join(tables)}, and one request reads one "
+                "table; let the plant hold all tags in one."
+            )
         self._written = dict(sorted(written.items(), key=lambda item: item[1].address))
         _require_block("written", written)
         ordered = list(self._written.values())
@@ -83,6 +91,13 @@ class ModbusLink:
             register.table == "input" for register in ordered
         ):
             raise ValueError(f"written={dict(written)} must be holding registers one behind the other, without gaps.")
+        if client.retries:
+            raise ValueError(
+                f"retries={client.retries} of the client must be 0: while it tries again, no command reaches the plant."
+            )
+        require_timeout(client.comm_params.timeout_connect)
+        self._client, self._device, self._joined = client, device, False
+        self._read, self._table = dict(read), tables[0]
 
     @property
     def _address(self) -> str:
@@ -96,17 +111,16 @@ class ModbusLink:
         self._joined = True
 
     def read(self) -> dict[str, float]:
+        first = min(register.address for register in self._read.values())
+        count = max(register.end for register in self._read.values()) - first
+        request = getattr(self._client, f"read_{self._table}_registers")
+        what = f"to read {', '.join(self._read)}"
+        words = self._asked(what, request, first, count=count, device_id=self._device).registers
         reading = {}
-        for table, registers in self._read.items():
-            first = min(register.address for register in registers.values())
-            count = max(register.end for register in registers.values()) - first
-            request = getattr(self._client, f"read_{table}_registers")
-            what = f"to read {', '.join(registers)}"
-            words = self._asked(what, request, first, count=count, device_id=self._device).registers
-            for tag, register in registers.items():
-                there = words[register.address - first : register.end - first]
-                number = self._client.convert_from_registers(there, self._kind(register), register.word_order)
-                reading[tag] = register.scale * number
+        for tag, register in self._read.items():
+            there = words[register.address - first : register.end - first]
+            number = self._client.convert_from_registers(there, self._kind(register), register.word_order)
+            reading[tag] = register.scale * number
         return reading
 
     def write(self, values: Mapping[str, float]) -> None:
