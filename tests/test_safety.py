@@ -10,7 +10,7 @@ from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import GymEnv, GymWrapper
+from torchrl.envs import GymEnv, GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl.algorithm import ReinforcementTwinning
@@ -21,7 +21,8 @@ from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
-from rt_torchrl.systems.safety import ActionLimits, SafetyLayer
+from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, layer_of
+from rt_torchrl.systems.sound_part import report_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 DT = 0.1
@@ -230,6 +231,17 @@ def test_what_the_layer_does_not_have_is_the_systems():
     assert torch.equal(env.reset()["state"], first)
     with pytest.raises(AttributeError, match="nonsense"):
         _ = env.nonsense
+
+
+def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_own():
+    """A transformed environment passes names on to what it transforms, whose own ``env`` is the system in the layer."""
+    guarded = failing(broken=[1])
+    inner = TransformedEnv(guarded, StepCounter())
+    entries = {name: Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
+    for env in (inner, RealSystem(inner, LinearQuadratic(horizon=2.0), **entries)):
+        assert layer_of(env) is guarded
+        fly(env, [0.0] * 3, steps=3)
+        assert report_of(env).wrong == {1} and report_of(env).counts["not finite"] == 1
 
 
 def test_what_cannot_be_guarded_is_refused():

@@ -1,6 +1,6 @@
 """The real system in simulation: any plant as a TorchRL environment, and environments around systems."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from rt_torchrl.options import OTHER_UNITS, require_number
 from rt_torchrl.plants.plant import Plant, Transition, with_memories
@@ -326,9 +326,16 @@ class AroundSystem(EnvBase):
         return found
 
 
+def layers(env: EnvBase) -> Iterator[EnvBase]:
+    """A system and those within it, from the outside in; a transformed one is followed by that which it transforms."""
+    while isinstance(env, EnvBase):
+        yield env
+        env = env.base_env if isinstance(env, TransformedEnv) else getattr(env, "env", None)
+
+
 def innermost(env: EnvBase) -> EnvBase:
     """The system within everything that stands around it."""
-    return innermost(env.env) if isinstance(env, AroundSystem) else env
+    return next(layer for layer in layers(env) if not isinstance(layer, AroundSystem))
 
 
 def require_interval(env: EnvBase, interval: float) -> None:

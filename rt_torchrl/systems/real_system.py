@@ -11,13 +11,13 @@ from jaxtyping import Float
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
+from torchrl.envs import EnvBase, GymWrapper
 
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.options import array_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.systems.environment import AroundSystem, declare_specs, ended_early, innermost
+from rt_torchrl.systems.environment import AroundSystem, declare_specs, ended_early, innermost, layers
 
 
 def joined(*entries: Tensor) -> Tensor:
@@ -305,7 +305,8 @@ class RealSystem(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         # The seed counts episodes, not resets: a reset need not be followed by a step.
         seed = None if self._seed is None else episode_seed(self._seed, self._episodes)
-        in_reset = seed is not None and _is_gymnasium(self.env)  # whose set_seed would reset once more
+        gymnasium = any(isinstance(layer, GymWrapper) for layer in layers(self.env))
+        in_reset = seed is not None and gymnasium  # whose set_seed would reset once more
         if seed is not None and not in_reset:
             self.env.set_seed(seed, static_seed=True)
         self._reported, self._step_count = self.env.reset(**({"seed": seed} if in_reset else {})), 0
@@ -406,10 +407,3 @@ class RealSystem(EnvBase):
         """Close the environment too, such as its simulator or its connection."""
         self.env.close(**kwargs)
         super().close(**kwargs)
-
-
-def _is_gymnasium(env: EnvBase) -> bool:
-    """Whether an environment is one of Gymnasium, which takes a seed in its reset."""
-    while isinstance(env, AroundSystem | TransformedEnv):
-        env = env.env if isinstance(env, AroundSystem) else env.base_env
-    return isinstance(env, GymWrapper)

@@ -19,7 +19,7 @@ from rt_torchrl.options import array_of, require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
-from rt_torchrl.systems.environment import AroundSystem, innermost, require_interval
+from rt_torchrl.systems.environment import AroundSystem, innermost, layers, require_interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
@@ -473,12 +473,9 @@ class SafetyLayer(AroundSystem):
         self.env.load_state_dict(state, *args, **kwargs)
 
 
-def layer_of(env: object) -> SafetyLayer | None:
+def layer_of(env: EnvBase) -> SafetyLayer | None:
     """The safety layer of a real system; None if there is none."""
-    inner: Any = env
-    while inner is not None and not isinstance(inner, SafetyLayer):
-        inner = getattr(inner, "env", None)
-    return inner
+    return next((layer for layer in layers(env) if isinstance(layer, SafetyLayer)), None)
 
 
 class OperatingLimits:

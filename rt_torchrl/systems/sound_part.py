@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.safety import SafetyReport, layer_of
@@ -115,7 +116,7 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     return SoundPart(parts, _reported(report) + overflows, "; ".join(reasons), whole)
 
 
-def report_of(env: object) -> SafetyReport | None:
+def report_of(env: EnvBase) -> SafetyReport | None:
     """The report of the safety layer of a real system about its last episode; None if there is none."""
     layer = layer_of(env)
     return layer.report if layer is not None and layer.reports else None
