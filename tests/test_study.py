@@ -122,6 +122,27 @@ def test_what_diverges_costs_infinitely(tmp_path):
     comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()
 
 
+def test_a_panel_of_costs_that_are_all_infinite_is_drawn_empty(tmp_path):
+    folder = leave(tmp_path / "run", seed=0, costs=[NAN, NAN], curve=(NAN, NAN), valve=NAN)
+    comparison = Comparison("tanks", [Row(name="a", runs=[FinishedRun.read(folder)], optimum=math.inf)])
+    assert cells(comparison.table())["a"][2] == "inf"
+    figure = comparison_figure([comparison], "t")
+    figure.canvas.draw()
+    assert figure.axes[0].get_title(loc="left").startswith("tanks")
+
+
+@pytest.mark.parametrize(
+    ("optimum", "shown"), [(-1.0, "+10 %"), (-0.75, "-20 %"), (-0.9, "+0 %"), (2.0, "-145 %"), (0.0, None)]
+)
+def test_costs_below_zero_are_above_their_optimum_as_a_share_of_its_size(tmp_path, optimum, shown):
+    run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[-0.9, -0.9]))
+    row = Row(name="a", runs=[run], optimum=optimum, limit=[-1.0, 0.0])
+    comparison = Comparison("tanks", [row])
+    assert row.numbers(row)["over_limit"] is None  # a ratio says nothing of costs below zero
+    header = [cell.strip() for cell in comparison.table().splitlines()[0].strip("|").split("|")]
+    assert dict(zip(header, cells(comparison.table())["a"], strict=True)).get("over the optimum") == shown
+
+
 def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_path):
     first, second = rows(tmp_path)
     found = compare_runs([*first, *second])

@@ -127,7 +127,8 @@ class Row:
         name: name of the row.
         runs: the runs.
         optimum: least cost that a policy of this class can have on the unseen episodes; None if nobody knows it.
-        limit: least cost that any commands can have on each of the first unseen episodes; None if nobody knows it.
+        limit: least cost that any commands can have on each of the first unseen episodes, which has ratios where its
+            mean is positive; None if nobody knows it.
     """
 
     name: str
@@ -171,7 +172,8 @@ class Row:
         over_limit = None
         if self.limit:
             least, count = statistics.fmean(self.limit), len(self.limit)
-            over_limit = [statistics.fmean(run.costs[:count]) / least for run in self.runs]
+            if least > 0.0:
+                over_limit = [statistics.fmean(run.costs[:count]) / least for run in self.runs]
         return {
             "seeds": sorted(self.costs),
             "J_a": spread(list(self.costs.values())),
@@ -262,13 +264,12 @@ class Comparison:
         numbers: dict[str, dict[str, Any]] = self.numbers()["rows"]
         lines, merits = [], {}
         for name, row in numbers.items():
-            known = row["optimum"] is not None
             lines.append(
                 [
                     name,
                     str(len(row["seeds"])),
                     with_range(row["J_a"]),
-                    f"{100.0 * (row['J_a']['median'] / row['optimum'] - 1.0):+.3g} %" if known else "",
+                    above(row["J_a"]["median"], row["optimum"]),
                     with_range(row["over_limit"]),
                     with_interval(row["J_a_ratio"]),
                     with_range(row["paid"]),
@@ -352,6 +353,13 @@ def paired_ratio(costs: dict[int, float], others: dict[int, float]) -> dict[str,
     return {"ratio": math.exp(mean), "low": math.exp(mean - half), "high": math.exp(mean + half)}
 
 
+def above(cost: float, optimum: float | None) -> str:
+    """How far a cost is above the optimum, as a share of its size, for a table; empty where it has none."""
+    if not optimum or not math.isfinite(optimum):
+        return ""
+    return f"{100.0 * (cost - optimum) / abs(optimum):+.3g} %"
+
+
 def with_range(values: dict[str, float] | None) -> str:
     """A median with its range, for a table."""
     if values is None:
@@ -428,16 +436,18 @@ def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) ->
     if top > 0.0 and shown.max() > top:
         shown = shown[shown <= top]
         ax.set_ylim(top=1.05 * shown.max())
-        above = [name for name, median in medians.items() if median.min() > top]
-        note = f"up to {1.05 * shown.max():.2g}" + (f"; above: {', '.join(above)}" if above else "")
+        dearer = [name for name, median in medians.items() if median.min() > top]
+        note = f"up to {1.05 * shown.max():.2g}" + (f"; above: {', '.join(dearer)}" if dearer else "")
+    caption(ax, f"{title}: $J_a$", note)
     shown = shown[np.isfinite(shown)]
+    if not len(shown):
+        return
     if shown.min() > 0.0 and shown.max() > WIDEST_LINEAR * shown.min():
         ax.set_yscale("log")
         plain_numbers(ax)
         ax.set_ylim(bottom=0.9 * shown.min())
     else:
         ax.set_ylim(bottom=shown.min() - 0.05 * (shown.max() - shown.min()))
-    caption(ax, f"{title}: $J_a$", note)
 
 
 def _numbers(values: Iterable[float | None]) -> list[float]:
