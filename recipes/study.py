@@ -31,8 +31,8 @@ from rt_torchrl.options import AtLeastOne, Count
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.compare import FinishedRun, Row, markdown, with_interval
 from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of
-from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings
-from rt_torchrl.steps.config import Arm
+from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings, settings_of, task_of
+from rt_torchrl.steps.config import Arm, Role
 
 PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
 ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
@@ -188,6 +188,10 @@ class Training:
             return False
         asked = self.asked()
         found = differences(self.folder, asked, HARMLESS - {"unseen_every"})
+        origins = (read_settings(self.folder).get("recipe") or {}, settings_of(asked, "")["recipe"])
+        its, mine = (origin.get("file") for origin in origins)
+        if its != mine:
+            found.append(f"the recipe is {mine} here and was {its} in the run")
         metrics = read_json(self.folder / "metrics.json")
         done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes
         if done > wanted:
@@ -238,12 +242,17 @@ class Yardstick:
     place: Path
 
     def of(self) -> dict[str, Any]:
-        """What the cost depends on: the options that this recipe alone has, those of the policy, and the effort."""
+        """What the cost depends on: recipe, task, unseen episodes and effort; an optimum also on the class of policies.
+
+        What policies observe may depend on options of every run, such as the preset.
+        """
         config = options_of(self.recipe, self.words).effective()
-        general = {field.name for field in dataclasses.fields(RunConfig)} - {"policy", "hidden", "unseen"}
-        options = {name: value for name, value in as_written(config).items() if name not in general}
+        of = {"kind": self.kind, "recipe": str(self.recipe.resolve()), "effort": self.effort, "unseen": config.unseen}
+        if self.kind == "optimum":
+            observed = [signal.name for signal in physics_of(config).observations]
+            of |= {"policy": config.policy, "hidden": config.hidden, "observations": observed}
         worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes}
-        return {"kind": self.kind, "recipe": self.recipe.stem, "effort": self.effort, **options, **worn}
+        return of | task_of(as_written(config)) | worn
 
     @functools.cached_property
     def path(self) -> Path:
@@ -424,7 +433,8 @@ def comparisons_of(
 ) -> list[Comparison]:
     """The finished runs of each system by arm, beside their yardsticks.
 
-    The optimum of a class of policies is the least cost that anybody has found: the search by gradients, or a run.
+    The optimum of a class of policies is the least cost that anybody has found: the search by gradients, or a run that
+    ended with a policy of the class.
     """
     finished = {
         key: [FinishedRun.read(training.folder) for training in group if training.finished()]
@@ -434,7 +444,8 @@ def comparisons_of(
     for key, runs in finished.items():
         if runs and "optimum" in yardsticks[key] and (kept := yardsticks[key]["optimum"].kept()):
             path, sought = yardsticks[key]["optimum"].path, math.inf if kept["J_a"] is None else kept["J_a"]
-            least[path] = min(least.get(path, sought), *(run.cost for run in runs))
+            asked = trainings[key][0].asked()
+            least[path] = min([least.get(path, sought), *(run.cost for run in runs if of_the_class(run.live, asked))])
     rows: dict[str, list[Row]] = {}
     for (system, arm), runs in finished.items():
         of = yardsticks[system, arm]
@@ -443,6 +454,13 @@ def comparisons_of(
         if runs:
             rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum, limit=limit))
     return [Comparison(system, of_system) for system, of_system in rows.items()]
+
+
+def of_the_class(role: Role, config: RunConfig) -> bool:
+    """Whether the policy of a role is of the class that ``config.policy`` names."""
+    if role == "model_based":
+        return config.twinning.planner.method != "receding_horizon"
+    return config.model_free_policy in ("same", config.policy)
 
 
 def main(config: Config) -> None:

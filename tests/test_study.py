@@ -1,11 +1,13 @@
 """Finished runs beside each other, and the study that makes them: numbers by hand, and small trainings."""
 
+import dataclasses
 import json
 import math
 import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -350,7 +352,50 @@ def test_what_an_optimum_depends_on_has_a_file_of_its_own(tmp_path):
     plain = of("")["optimum"]
     assert plain.path == of("--twinning.arm model_free --episodes 7")["optimum"].path
     others = [of("--horizon 1.0")["optimum"], of("--unseen 5")["optimum"], of("", quick=True)["optimum"]]
-    assert len({plain.path, *(other.path for other in others)}) == 4
+    elsewhere = tmp_path / TINY.name
+    elsewhere.write_text(TINY.read_text())
+    others.append(study.Yardstick("optimum", elsewhere, (), {}, tmp_path / "yardsticks"))
+    assert len({plain.path, *(other.path for other in others)}) == 5
     assert list(of("", limit=3, optimum=False)) == ["limit"]
+    # The limit belongs to the commands, whatever the policies are; what these observe may follow from the preset.
+    limits = [of(words, limit=3)["limit"] for words in ("", "--policy mlp --hidden 4", "--horizon 1.0")]
+    assert limits[0].path == limits[1].path != limits[2].path
+    turbine = Path(study.__file__).with_name("wind_turbine.py")
+    words = ("--preset paper --policy mlp", "--policy mlp", "--policy mlp --observe paper")
+    made = [study.Yardstick("optimum", turbine, tuple(text.split()), {}, tmp_path) for text in words]
+    assert made[0].path == made[2].path != made[1].path
     message = "does not say how the limit is computed"
     assert message in study.failure_of(of("", limit=3)["limit"])
+
+
+def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
+    """Model predictive control, and a policy of another class, may cost less than the optimum of the class."""
+    twinning = {name: ("--twinning.planner.method", name) for name in ("single_start", "receding_horizon")}
+    arms = {
+        "plan": (twinning["single_start"], 0.9, "model_based"),
+        "mpc": (twinning["receding_horizon"], 0.5, "model_based"),
+        "other": (("--model-free-policy", "mlp"), 0.4, "model_free"),
+    }
+    trainings, yardsticks = {}, {}
+    for arm, (words, cost, live) in arms.items():
+        folder = leave(tmp_path / arm, seed=0, costs=[cost, cost], arm=arm)
+        metrics = json.loads((folder / "metrics.json").read_text())
+        metrics["summary"]["live"], metrics["summary"]["unseen"]["costs"][live] = live, [cost, cost]
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+        asked = study.options_of(TINY, words)
+        trainings["tiny", arm] = [
+            SimpleNamespace(folder=folder, finished=lambda: True, asked=lambda asked=asked: asked)
+        ]
+        searched = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
+        yardsticks["tiny", arm] = {"optimum": searched}
+    (found,) = study.comparisons_of(trainings, yardsticks)
+    assert [row.optimum for row in found.rows] == [0.9] * 3
+
+
+def test_a_folder_with_a_run_of_another_recipe_is_refused(tmp_path):
+    made = config(tmp_path / "study", seeds=1, optimum=False)
+    study.studied(made)
+    elsewhere = tmp_path / TINY.name
+    elsewhere.write_text(TINY.read_text())
+    with pytest.raises(ValueError, match=rf"the recipe is {elsewhere} here and was {TINY.resolve()} in the run"):
+        study.studied(dataclasses.replace(made, systems=(f"tiny={elsewhere}",)))

@@ -4,14 +4,14 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, flat, read_settings
+from rt_torchrl.runs.settings import BESIDE, flat, read_settings, task_of
+from rt_torchrl.steps.config import Role
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,6 @@ NEAR = 0.1
 """Distance from the optimum, as a share of it, within which a policy is near the optimum."""
 ROUNDING = 1e-6
 """Relative difference of a controller's costs on the same episodes that counts as rounding."""
-OF_EVERY_RUN = frozenset(option.name for option in fields(RunConfig))
 APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
 """Settings in which the runs of one row may differ."""
 WIDEST_LINEAR = 5.0
@@ -41,7 +40,8 @@ class FinishedRun:
         folder: run folder.
         settings: content of ``config.json``.
         place: system that the costs on unseen episodes are those of: the simulated or the real one.
-        costs: J_a of the policy that was live at the end, on each unseen episode.
+        live: role of the policy that was live at the end.
+        costs: J_a of that policy on each unseen episode.
         curve: mean J_a of the live policy on the unseen episodes after each real episode (``--unseen-every 1``), or
             J_a of the real episodes.
         judged: whether ``curve`` holds costs on unseen episodes.
@@ -57,6 +57,7 @@ class FinishedRun:
     folder: Path
     settings: dict[str, Any]
     place: str
+    live: Role
     costs: list[float]
     curve: list[float]
     judged: bool
@@ -79,8 +80,8 @@ class FinishedRun:
 
     @property
     def task(self) -> dict[str, Any]:
-        """The options that make plant, inputs and cost: those that only this recipe has, but what policies observe."""
-        return {k: v for k, v in self.settings.items() if k not in {*OF_EVERY_RUN, *BESIDE, "observe"}}
+        """The options that make plant, inputs and cost."""
+        return task_of(self.settings)
 
     @classmethod
     def read(cls, folder: Path) -> "FinishedRun":
@@ -106,6 +107,7 @@ class FinishedRun:
             folder=folder,
             settings=settings,
             place="real system" if on_the_twin(summary["unseen"]) else "simulation",
+            live=live,
             costs=_numbers(unseen["costs"][live]),
             curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
             judged=judged,

@@ -26,6 +26,7 @@ RAN = "ran"
 BESIDE = ("plant", "recipe", RAN)
 """Keys of ``config.json`` that are not options."""
 LIBRARY = __name__.partition(".")[0]
+OF_EVERY_RUN = frozenset(option.name for option in dataclasses.fields(RunConfig))
 GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
 
 
@@ -41,6 +42,11 @@ def settings_of(config: RunConfig, plant: str) -> dict[str, Any]:
         ``class``, ``module`` (null for a script) and ``file`` (null for an interactive session).
     """
     return dataclasses.asdict(config) | {"plant": plant, "recipe": _origin(type(config))}
+
+
+def task_of(settings: dict[str, Any]) -> dict[str, Any]:
+    """The options that make plant, inputs and cost: those that only this recipe has, but what policies observe."""
+    return {key: value for key, value in settings.items() if key not in {*OF_EVERY_RUN, *BESIDE, "observe"}}
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
