@@ -9,6 +9,7 @@ import math
 import re
 import shlex
 import statistics
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -65,7 +66,7 @@ class Config:
             whose machines share the folder.
         quick: make two seeds of small trainings.
         runs: folders of finished runs of one plant, which are compared instead of training; those that differ in
-            nothing but the seed are one row.
+            nothing but the seed are one row. The results need a folder that holds no study of trainings.
         log_dir: folder of the runs and of the results.
     """
 
@@ -207,7 +208,7 @@ class Training:
         return patient and metrics["summary"].get("ended") is not None
 
     def run(self) -> None:
-        """Train, or go on with what is there. ``training.log`` in the folder takes what the recipe prints."""
+        """Train, or go on with what is there. ``training.log`` in the folder takes all output, and a traceback."""
         if self.finished():
             return
         config = dataclasses.replace(self.asked(), resume=(self.folder / FILE).is_file())
@@ -215,7 +216,11 @@ class Training:
         log = (self.folder / "training.log").open("a", encoding="utf-8")
         with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             print(shlex.join([str(self.recipe), *EVERY, *self.words, "--seed", str(self.seed)]), flush=True)
-            load_recipe(self.recipe).main(config)
+            try:
+                load_recipe(self.recipe).main(config)
+            except Exception:
+                traceback.print_exc()
+                raise
         if self.finished():
             return
         if read_json(self.folder / "metrics.json") is None:
@@ -349,23 +354,20 @@ def run_all(tasks: Sequence[Training | Yardstick], *, jobs: int = 0, backend: st
         return []
     returned = "list" if backend == "ray" else "generator_unordered"
     workers = Parallel(n_jobs=jobs or -1, backend=backend, batch_size=1, return_as=returned)
-    calls = [delayed(in_a_worker)(__file__, type(task).__name__, vars_of(task)) for task in missing]
+    calls = [delayed(in_a_worker)(__file__, type(task).__name__, dataclasses.asdict(task)) for task in missing]
     with termination_as_interrupt(), tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc="study") as bar:
         try:
             for failure in workers(calls):
                 if failure == "interrupted":
                     raise KeyboardInterrupt
-                failures += [failure] if failure else []
+                if failure:
+                    failures.append(failure)
+                    bar.write(failure)
                 bar.update()
         except KeyboardInterrupt:
             bar.write(f"interrupted: {bar.n} of {len(tasks)} are finished; the same command goes on")
             raise
     return failures
-
-
-def vars_of(task: Training | Yardstick) -> dict[str, Any]:
-    """The arguments that make a task."""
-    return {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
 
 
 def register_ray() -> None:
@@ -465,6 +467,9 @@ def of_the_class(role: Role, config: RunConfig) -> bool:
 
 def main(config: Config) -> None:
     make_folder("log_dir", config.log_dir)
+    before = read_json(config.log_dir / "study.json")
+    if config.runs and before is not None and not before["config"]["runs"]:
+        raise ValueError(f"log_dir={config.log_dir} holds a study of trainings; give the comparison another folder.")
     comparisons, failures = ([compare_runs(config.runs)], []) if config.runs else studied(config)
     if comparisons:
         print(write(config, comparisons))

@@ -154,6 +154,8 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     other = leave(tmp_path / "other", seed=0, costs=[7.0, 7.0], valve=6.0, task="engineering")
     found = compare_runs([first[0], seeing, other])
     assert [len(group) for group in found.tasks()] == [2, 1]  # what a policy sees changes no task
+    drawn = leave(tmp_path / "drawn", seed=9, costs=[1.0, 1.0], figures=False, compiled=True, untrained=0)
+    assert [len(row.runs) for row in compare_runs([first[0], drawn]).rows] == [2]  # nor do figures and compilation
     numbers = found.numbers()
     names = list(numbers["rows"])
     assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
@@ -327,6 +329,32 @@ def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"1 failed, the others are kept:\n.*seed-1: ZeroDivisionError: division"):
         study.main(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
     assert "| twinning | 1 |" in capsys.readouterr().out
+    log = (tmp_path / "study" / "tiny" / "twinning" / "seed-1" / "training.log").read_text()
+    assert "Traceback" in log and "1 / 0" in log and "ZeroDivisionError" in log
+
+
+def test_a_failure_is_told_also_where_no_results_can_be_written(tmp_path, capsys, monkeypatch):
+    broken = tmp_path / "broken.py"
+    broken.write_text(TINY.read_text().replace("    Run(config", "    1 / 0\n    Run(config"))
+
+    def full(*parts):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(study, "comparisons_of", full)
+    with pytest.raises(OSError, match="no space left"):
+        study.studied(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
+    assert "seed-1: ZeroDivisionError: division by zero" in "".join(capsys.readouterr())
+
+
+def test_a_comparison_of_runs_does_not_take_the_place_of_a_study(tmp_path):
+    study.main(config(tmp_path / "study", seeds=1, optimum=False))
+    kept = (tmp_path / "study" / "study.md").read_bytes()
+    run = tmp_path / "study" / "tiny" / "twinning" / "seed-0"
+    with pytest.raises(ValueError, match="holds a study of trainings; give the comparison another folder"):
+        study.main(config(tmp_path / "study", runs=(run,)))
+    assert (tmp_path / "study" / "study.md").read_bytes() == kept
+    for _ in range(2):  # a comparison takes the place of itself
+        study.main(config(tmp_path / "compared", runs=(run,)))
 
 
 def test_ray_is_asked_for_by_name(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ import rt_torchrl.envs
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, as_written, module_of, named
+from rt_torchrl.runs.settings import BESIDE, OF_THE_CALL, as_written, module_of, named
 from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
 
 Configuration = TypeVar("Configuration")
@@ -120,10 +120,6 @@ def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bo
         if helped:  # beside words that cannot be carried out, too
             return config_class().defaults()
         raise
-
-
-OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
-"""Options that a file of options never gives."""
 
 
 def of_file(path: Path, asked: RunConfig) -> RunConfig:

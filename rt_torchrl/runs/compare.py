@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rt_torchrl.runs.settings import BESIDE, flat, read_settings, task_of
+from rt_torchrl.runs.settings import BESIDE, BESIDE_TRAINING, flat, read_settings, task_of
 from rt_torchrl.steps.config import Role
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ NEAR = 0.1
 """Distance from the optimum, as a share of it, within which a policy is near the optimum."""
 ROUNDING = 1e-6
 """Relative difference of a controller's costs on the same episodes that counts as rounding."""
-APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
+APART = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
 WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which the axis of a panel is logarithmic."""

@@ -167,14 +167,17 @@ def _same(one: str | None, other: str) -> bool:
 
 
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
-HARMLESS = {
-    *("episodes", "patience", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
-    *("real_unseen", "checkpoints", "loggers"),
+OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
+"""Options that a file of options never gives."""
+BESIDE_TRAINING = {
+    *("figures", "figures_every", "untrained", "reference", "limit_episodes", "checkpoints", "loggers"),
     # These change a result by rounding alone.
     *("threads", "compiled"),
-    *("config", "log_dir", "resume", "overwrite"),
+    *OF_THE_CALL,
 }
-"""Options that may differ when a run is resumed: those of its length, its reports and its speed."""
+"""Options of the place, the reports and the speed of a run, under which it trains and costs the same."""
+HARMLESS = {*BESIDE_TRAINING, "episodes", "patience", "unseen_every", "real_unseen"}
+"""Options that may differ when a run is resumed: these and those of its length."""
 ABSENT = "nothing"
 
 
