@@ -10,7 +10,18 @@ from small_runs import SMALL
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem, Run, RunConfig, WiringError, check_real_system
+from rt_torchrl import (
+    Actuation,
+    PlantEnv,
+    Reading,
+    RealSystem,
+    Run,
+    RunConfig,
+    SafetyConfig,
+    SafetyLayer,
+    WiringError,
+    check_real_system,
+)
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
@@ -136,6 +147,38 @@ def test_an_ordinary_model_error_is_no_mistake():
     found = check_real_system(wired(plant, real=Draughty(horizon=5.0)), plant)
     assert found.present.unexplained.max() > 1e-2
     found.require()
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_a_reading_that_stands_still_where_the_twin_moves_is_named(column):
+    found = check_real_system(wired(PENDULUM, scale=only(PENDULUM, column, 0.0)), PENDULUM)
+    with pytest.raises(WiringError, match=f"state {PENDULUM.states[column].name} did not stand still") as raised:
+        found.require()
+    assert "it does not move" in str(raised.value) and "nan" not in str(raised.value)
+
+
+def test_a_state_that_rounding_alone_moves_stands_still():
+    plant = LinearQuadratic(horizon=5.0)
+    found = check_real_system(wired(plant, scale=[1.0, 1e-13]), plant)
+    assert 0.0 < found.moved[1] < 1e-12 and f"{plant.states[1].unit}; it does not move" in str(found)
+
+
+class Sparse(PlantEnv):
+    """A plant of whose readings every fifth is lost."""
+
+    def _step(self, tensordict):
+        found = super()._step(tensordict)
+        if self._step_count.item() % 5 == 0:
+            found["state"] = torch.full_like(found["state"], math.nan)
+        return found
+
+
+def test_intervals_that_begin_or_end_with_a_refused_reading_show_nothing():
+    guarded = SafetyLayer(Sparse(PENDULUM, seed=1), SafetyConfig(interval=PENDULUM.dt), fallback=(0.0,))
+    state, applied = Reading(keys=("state",)), Reading(keys=("applied",))
+    system = RealSystem(guarded, PENDULUM, state=state, exogenous=(), applied=applied)
+    found = check_real_system(system, PENDULUM)
+    assert found.sound and (found.present.unexplained < 1e-12).all()
 
 
 def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():

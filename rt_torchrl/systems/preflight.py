@@ -50,14 +50,14 @@ RATIOS = (0.1, 0.2, 0.25, 0.4, 0.5, 2.0, 2.5, 4.0, 5.0, 10.0)
 """Ratios of the real control interval to the plant's that are tried."""
 CORRELATION = 3.0
 """Correlation time of the noise, in control intervals: noise that is new in each one hardly moves a slow plant."""
-STILL = 1e-9
-"""Movement of a state, as a share of its size, below which it does not move."""
+STILL, RESOLUTION = 1e-9, 1e-3
+"""Movement of a state, as a share of its size: below the first it does not move, and beyond the second it shows."""
 UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "rad": (("deg", math.pi / 180.0, 0.0),),
     "rad/s": (("deg/s", math.pi / 180.0, 0.0), ("rpm", math.pi / 30.0, 0.0)),
     "deg": (("rad", 180.0 / math.pi, 0.0),),
     "deg/s": (("rad/s", 180.0 / math.pi, 0.0),),
-    "K": (("°C", 1.0, 273.15), ("°F", 5.0 / 9.0, 255.372)),
+    "K": (("°C", 1.0, 273.15), ("°F", 5.0 / 9.0, 459.67 * 5.0 / 9.0)),
     "°C": (("K", 1.0, -273.15), ("°F", 5.0 / 9.0, -17.778)),
     "Pa": (("kPa", 1e3, 0.0), ("bar", 1e5, 0.0)),
     "m": (("mm", 1e-3, 0.0),),
@@ -129,7 +129,7 @@ class Wiring(NamedTuple):
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
         signals = zip(self.plant.states, self.moved.tolist(), *self.present[1:], strict=True)
         for signal, moved, unexplained, error in signals:
-            share = f"{100.0 * unexplained:.3g} % unexplained" if moved else "it does not move"
+            share = f"{100.0 * unexplained:.3g} % unexplained" if math.isfinite(unexplained) else "it does not move"
             rows.append(f"  {signal.name}: moves by {moved:.4g}, predicted to {error:.4g} {signal.unit}; {share}")
         for mistake in self.mistakes:
             shares = ", ".join(
@@ -137,7 +137,7 @@ class Wiring(NamedTuple):
                 for signal, share in zip(self.plant.states, mistake.unexplained.tolist(), strict=True)
                 if math.isfinite(share)
             )
-            rows.append(f"  much less is unexplained if {mistake.mistake}: {shares}")
+            rows.append(f"  much less is unexplained if {mistake.mistake}{shares and ': '}{shares}")
         return "\n".join(rows)
 
     def require(self) -> None:
@@ -165,7 +165,8 @@ def check_real_system(
     """Compare one-step predictions of the twin with readings over a few starts, and name what fits better.
 
     The real system flies ``STARTS`` times ``INTERVALS`` control intervals, with noise on the commands, because what
-    does not move shows nothing. The sequence of its episodes then goes on as if nothing had been flown.
+    does not move shows nothing. The sequence of its episodes then goes on as if nothing had been flown. A reading that
+    stands still where the twin moves by more than ``RESOLUTION`` is a mistake, too.
 
     Args:
         env: the real system, of batch size 1.
@@ -174,6 +175,9 @@ def check_real_system(
         policy: policy or controller that acts; None for commands around the middle of their ranges.
         spread: standard deviation of the noise, as a share of half the range of each action.
         seed: seed of noise and first guess.
+
+    Raises:
+        WiringError: if a safety layer refuses every reading.
     """
     generator = torch.Generator(device=env.device).manual_seed(seed)
     closure = plant.make_closure(generator) if closure is None else closure
@@ -194,10 +198,17 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
 def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     plant = copy.deepcopy(plant).cpu()
     fit = _Fit(plant, closure)
-    present, mistakes = fit.suspicion("", flown), list[Suspicion]()
-    if (present.unexplained > EXPLAINED).any():
+    present, (moved, moves) = fit.suspicion("", flown), fit.movement(flown)
+    stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
+    names, unknown = (signal.name for signal in plant.states), torch.full_like(moved, torch.nan)
+    mistakes = [
+        Suspicion(f"the reading of state {name} did not stand still", unknown, present.error)
+        for name, stands in zip(names, stuck, strict=True)
+        if stands
+    ]
+    if not mistakes and (present.unexplained > EXPLAINED).any():
         mistakes = _better(present, fit, list(_mistakes(plant, flown)))
-    return Wiring(plant, present, _movement(plant, flown).square().mean(0).sqrt(), tuple(mistakes))
+    return Wiring(plant, present, moved, tuple(mistakes))
 
 
 def _better(present: Suspicion, fit: "_Fit", mistakes: list[tuple[str, Flown]]) -> list[Suspicion]:
@@ -242,7 +253,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
                 row = env.step(row.set("action", live(row["observation"], row["state"], row["exogenous"])))
                 after, t = row["next"], row["state"].new_full((1,), k * plant.dt)
                 now = after["applied"].clone(), row["exogenous"].clone()
-                if not ("refused" in after and after["refused"].any()):
+                if not any("refused" in reading and reading["refused"].any() for reading in (row, after)):
                     rows.append(Flown(t, row["state"].clone(), *now, after["state"].clone(), earlier or now))
                 if after["done"].any():
                     break
@@ -289,11 +300,11 @@ class _Fit:
 
     def _suspicion(self, mistake: str, flown: Flown, weights: Tensor) -> Suspicion:
         error = self._errors(flown, weights)[0].square().mean(0)
-        size, moves = self._size(flown)
+        size, moves = self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
         return Suspicion(mistake, share, error.sqrt())
 
-    def _size(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
+    def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
         size = _movement(self._plant, flown).square().mean(0).sqrt()
         return size, size > STILL * (1.0 + flown.states.abs().amax(0))
@@ -301,7 +312,7 @@ class _Fit:
     def _fitted(self, flown: Flown) -> Tensor:
         from scipy.optimize import least_squares  # here, because it takes a second to load
 
-        size, moves = self._size(flown)
+        size, moves = self.movement(flown)
         latest: dict[str, Tensor] = {}
 
         def residuals(weights: np.ndarray) -> np.ndarray:
