@@ -4,7 +4,7 @@ Parameters without a source are engineering guesses.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from rt_torchrl.plants.actuators import (
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import Action, Hidden, Input, Inputs, State, Time
+from rt_torchrl.plants.shapes import Action, Hidden, Input, Inputs, Scalar, State, Time
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import NeuralResidual, ScaledCoefficients
 
@@ -97,7 +97,28 @@ class LaggedInflow(Extension):
         return (power / MEGA).unsqueeze(-1)
 
 
-class MisreadWind(Extension):
+class Blown(Extension):
+    """A turbine in other wind, or with other torques, whose vector field is integrated.
+
+    Args:
+        base: the turbine, perhaps extended.
+        hidden: signals of the hidden states.
+
+    Raises:
+        ValueError: if the turbine does not step by its vector field.
+    """
+
+    advance = Plant.advance
+
+    def __init__(self, base: Plant, hidden: Sequence[Signal] = ()):
+        if base.own_scheme:
+            raise ValueError(
+                f"{type(self).__name__} integrates the vector field; extend its result by actuators, not its base."
+            )
+        super().__init__(base, hidden)
+
+
+class MisreadWind(Blown):
     r"""A turbine in a wind u of which the anemometer reads gu.
 
     The exogenous input of the extended plant is what the anemometer *reads*: records, previews and the filtered wind
@@ -112,14 +133,10 @@ class MisreadWind(Extension):
         ValueError: if the gain is not positive and finite, or the turbine does not step by its vector field.
     """
 
-    advance = Plant.advance
-
     def __init__(self, base: Plant, gain: float):
         if not 0.0 < gain < math.inf:
             raise ValueError(f"gain={gain} of the anemometer must be positive and finite.")
-        if base.own_scheme:
-            raise ValueError("MisreadWind integrates the vector field; extend its result by actuators, not its base.")
-        super().__init__(base, [])
+        super().__init__(base)
         turbine: Any = base.innermost
         self.gain, self.cutoff = gain, 2.0 * math.pi * turbine.filter_frequency
 
@@ -140,62 +157,71 @@ class MisreadWind(Extension):
         return read.clamp(min=self.inputs[0].low)
 
 
-class SwayingTower(Extension):
+class SwayingTower(Blown):
     r"""A turbine whose tower sways fore and aft, so that rotor and anemometer meet the wind u − v.
 
-    .. math:: m\dot v = \tfrac12\rho A\,(u - v)^2 C_T(\beta) - 2\zeta m\Omega v - m\Omega^2x, \qquad \dot x = v
+    .. math:: m\dot v = F(u - v, \beta) - 2\zeta m\Omega v - m\Omega^2x, \qquad \dot x = v, \qquad
+        F = \tfrac12\rho A\,u^2 C_T(\beta)
 
     Mass m = 437 t (rotor and nacelle 350 t, a quarter of the tower), Ω = 2.04 rad/s and ζ = 1 % of the first fore-aft
     mode: NREL/TP-500-38060. Thrust :math:`C_T = 0.81 e^{-\beta/9\,\mathrm{deg}}`: a fit to the thrust curve there.
 
     Args:
         base: the turbine, perhaps extended.
-        softness: share by which Ω is lower than that of the reference tower.
+        softness: share by which Ω is lower than that of the reference tower, in [0, 1).
+
+    Raises:
+        ValueError: if the softness is out of its range, or the turbine does not step by its vector field.
     """
 
-    advance = Plant.advance
     mass, natural_frequency, damping = 437e3, 2.04, 0.01
     thrust_coefficient, thrust_pitch = 0.81, 9.0
 
     def __init__(self, base: Plant, softness: float = 0.0):
-        super().__init__(
-            base,
-            [Signal(symbol="x", name="tower_top", unit="m"), Signal(symbol="v", name="tower_top_speed", unit="m/s")],
-        )
+        if not 0.0 <= softness < 1.0:
+            raise ValueError(f"softness={softness} of the tower must lie in [0, 1).")
+        place = Signal(symbol="x", name="tower_top", unit="m")
+        super().__init__(base, [place, Signal(symbol="v", name="tower_top_speed", unit="m/s")])
         self.frequency = self.natural_frequency * (1.0 - softness)
 
-    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+    def thrust(self, wind: Scalar, pitch: Scalar) -> Scalar:
+        """F [N] of the rotor in a wind [m/s] at a pitch [deg]."""
         turbine: Any = self.base.innermost
+        coefficient = self.thrust_coefficient * torch.exp(-pitch / self.thrust_pitch)
+        return 0.5 * turbine.air_density * math.pi * turbine.radius**2 * wind.square() * coefficient
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         (base, hidden), met = self.split(state), exogenous[..., 0] - state[..., -1]
         x, v = hidden.unbind(-1)
         field = self.base.vector_field(t, base, action, replaced(exogenous, 0, met), closure)
-        area = math.pi * turbine.radius**2
-        coefficient = self.thrust_coefficient * torch.exp(-action[..., 1] / self.thrust_pitch)
-        thrust = 0.5 * turbine.air_density * area * met.square() * coefficient / self.mass
         spring = self.frequency**2 * x + 2.0 * self.damping * self.frequency * v
-        return torch.cat([field, torch.stack([v, thrust - spring], -1)], -1)
+        return torch.cat([field, torch.stack([v, self.thrust(met, action[..., 1]) / self.mass - spring], -1)], -1)
 
     def rest(self, base: State) -> Hidden:
         """The tower stands as the wind bends it on average, without motion."""
-        turbine: Any = self.base.innermost
-        coefficient = self.thrust_coefficient * torch.exp(-base[..., 5] / self.thrust_pitch)
-        thrust = 0.5 * turbine.air_density * math.pi * turbine.radius**2 * base[..., 2].square() * coefficient
-        x = thrust / (self.mass * self.frequency**2)
+        x = self.thrust(base[..., 2], base[..., 5]) / (self.mass * self.frequency**2)
         return torch.stack([x, torch.zeros_like(x)], -1)
 
 
-class LossySpeed(Extension):
+class LossySpeed(Blown):
     r"""A turbine whose drive train takes a share of the rated torque that grows with the square of the speed.
 
     .. math:: J\dot\omega_r = \ldots - \kappa\,N_g\tau_\mathrm{rated}\,(\omega_r/\omega_\mathrm{rated})^2
 
-    Churning of oil and windage of the generator; share κ: engineering guess, gearboxes lose 3 to 6 %.
+    Churning of oil and windage of the generator: engineering guess, gearboxes lose 3 to 6 %.
+
+    Args:
+        base: the turbine, perhaps extended.
+        share: share κ of the rated torque at rated speed.
+
+    Raises:
+        ValueError: if the share is not positive and finite, or the turbine does not step by its vector field.
     """
 
-    advance = Plant.advance
-
     def __init__(self, base: Plant, share: float):
-        super().__init__(base, [])
+        if not 0.0 < share < math.inf:
+            raise ValueError(f"share={share} of the rated torque must be positive and finite.")
+        super().__init__(base)
         self.share = share
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:

@@ -69,14 +69,14 @@ class Extension(Plant):
         own: parameters w of the true system, which are frozen; None for none. A twin begins with :meth:`fresh` ones.
 
     Raises:
-        ValueError: if the plant overrides ``step`` as a whole, so that nothing can act between actuator and system, or
-            has a state with the name of a hidden one.
+        ValueError: if the plant overrides ``step`` as a whole, so that nothing can act between actuator and system, and
+            the extension does not; or if it has a state with the name of a hidden one.
     """
 
     name = "extension"  # until the plant gives its own
 
     def __init__(self, base: Plant, hidden: Sequence[Signal], own: nn.Module | None = None):
-        if type(base).step is not Plant.step:
+        if type(base).step is not Plant.step and type(self).step is Plant.step:
             raise ValueError(
                 f"plant {base.name!r} overrides step(), so that nothing can act between its actuators and its system; "
                 "override actuate(), advance() and latch() instead."
