@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.command_cost import BoundedDescentConfig
@@ -22,6 +22,7 @@ from rt_torchrl.control.predictive_control import FUTURES, PredictiveConfig, Rec
 from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_start
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
+from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.options import AtLeastOne, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Inputs
@@ -339,12 +340,13 @@ def by_simplex(unseen: UnseenEpisodes, policy: nn.Module, count: int, *, size: f
 
     weights = [weight for weight in policy.parameters() if weight.requires_grad]
     start = parameters_to_vector(weights).detach()
-    scale = size * start.abs().clamp_min(0.1)
+    scale, rollout = size * start.abs().clamp_min(0.1), unseen.rollout(policy)
 
+    @torch.no_grad()
     def cost(shares: np.ndarray) -> float:
-        vector_to_parameters(start + scale * torch.as_tensor(shares, device=start.device), weights)
+        place(start + scale * torch.as_tensor(shares, device=start.device), weights)
         try:
-            value = unseen.control_costs(policy).mean().item()
+            value = rollout.costs(unseen.initial_state, unseen.exogenous).mean().item()
         except DivergenceError:
             return math.inf
         return value if math.isfinite(value) else math.inf

@@ -4,18 +4,20 @@ The twin flies each of the latest real episodes again under the policy, alone an
 episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin says,
 the better the nearer the policy is to the one that flew: its error has the variance
 
-.. math:: s_i^2 = \sigma^2 + v\,\|\pi - \pi_i\|^2
+.. math:: s_i^2 = \sigma^2 + n_iv\,\|\pi - \pi_i\|^2, \qquad n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
 
-with the mean square of the difference of actions, in shares of half their ranges. The corrections are averaged,
+with the mean square of the difference of actions, in shares of half their ranges. What other inputs change, σ, is
+independent in each episode; what the distance hides is the same for all n_i episodes that policies like this one flew.
+The corrections are averaged,
 
-.. math::
-    m = s^2\sum_i\frac{c_i}{n_is_i^2}, \qquad \frac1{s^2} = \sum_i\frac1{n_is_i^2}, \qquad
-    n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
+.. math:: m = s^2\sum_ic_i/s_i^2, \qquad s^{-2} = \sum_is_i^{-2}
 
-with the number n_i of episodes that policies like this one flew, which know the same. The cost that is expected on the
-real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes; plans, updates, clones and the referee of step 6
-take this one. How well the episodes predict each other chooses v. A twin that says of all these episodes what they
-cost, within σ and what exploration explains, keeps the word.
+and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes. Plans over
+whole episodes descend this one; updates, clones and the referee of step 6 compare it. Of weights that flew, their own n
+quiet flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
+episode refuted does not come back because policies like it were cheap. How well the episodes predict each other chooses
+σ and v. A twin that says of all these episodes what they cost, within 5 % and what exploration explains, is believed as
+it is.
 """
 
 import copy
@@ -24,9 +26,10 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten
@@ -34,7 +37,7 @@ from torch.utils._pytree import tree_flatten
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import findings, same_architecture
-from rt_torchrl.trajectories.anchored import AnchoredReplays, AnchoredTwin
+from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
@@ -45,13 +48,13 @@ HISTORY = 20
 ANCHORS = 8
 """Number of latest whole episodes whose anchored replays plans descend on; policies are judged by those of all."""
 NOISE = 0.05
-"""Standard deviation σ of the correction by an episode that was flown with the policy: what differs between inputs."""
+"""Least standard deviation σ of the correction by an episode that was flown with the policy, and what is expected."""
 LENGTH = 0.1
 """Distance ℓ of policies that are alike."""
 GROWTH = 10.0
 """The v that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
 PRIOR = 2.0
-"""Number of episodes that this expectation counts for."""
+"""Number of episodes that what is expected of σ and v counts for."""
 EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration, as a share of half the ranges."""
 DEARER = 5.0
@@ -85,9 +88,10 @@ class Judged(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The anchored replays of the latest real episodes, and the growth v of the variance of their corrections."""
+    """The anchored replays of the latest real episodes, and the variance σ² of their corrections with its growth v."""
 
     replays: AnchoredReplays
+    noise: float
     growth: float
 
 
@@ -106,9 +110,9 @@ class Belief:
         self.flown: list[Flown] = []
         self._differences: tuple[Any, list[float]] | None = None
         self._anchored: tuple[Any, Anchors | None] | None = None
-        self._twins: dict[DigitalTwin, AnchoredTwin] = {}
-        if corrects:
-            virtual.twin.correct(partial(self.correction, latest=ANCHORS))
+        self._twins: dict[DigitalTwin, DigitalTwin] = {}
+        self._copies: dict[Role, nn.Module] = {}
+        virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
 
     def append(
         self,
@@ -135,8 +139,13 @@ class Belief:
         self._differences = self._anchored = None
 
     def policy_of(self, flown: Flown) -> nn.Module:
-        """The policy that flew an episode, with the weights that it had in it."""
-        policy = copy.deepcopy(self._policies[flown.role])
+        """The policy that flew an episode, with the weights that it had in it, until the next call for this role.
+
+        There is one copy for each role, because the twin keeps the code of few modules.
+        """
+        if flown.role not in self._copies:
+            self._copies[flown.role] = copy.deepcopy(self._policies[flown.role])
+        policy = self._copies[flown.role]
         policy.load_state_dict(flown.weights)
         return policy
 
@@ -178,10 +187,7 @@ class Belief:
     def unexplained(self) -> float:
         """Size of the last paired difference beyond what exploration explains."""
         found = self.differences()
-        if not found or math.isnan(found[-1]):
-            return 0.0
-        explored = self.flown[-1].exploration
-        return abs(found[-1]) if explored <= QUIET else abs(found[-1]) - 2.0 * EXPLORED * explored
+        return 0.0 if not found or math.isnan(found[-1]) else beyond(found[-1], self.flown[-1].exploration)
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory]) -> float:
@@ -207,13 +213,18 @@ class Belief:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
         if not self.corrects or not 0.0 < cost < math.inf:
             return cost
+        anchors, weights = self._anchors(), dict(policy.state_dict())
+        pairs = zip(self.differences(), self.flown, strict=True)
+        flown = [d for d, one in pairs if one.exploration <= QUIET and equal(one.weights, weights)]
+        if anchors is not None and flown and not any(map(math.isnan, flown)):
+            return cost * math.exp((sum(flown) + 0.5 * anchors.noise) / len(flown))
         try:
-            return cost * math.exp(min(self.correction(policy).item(), DEARER))
+            return cost * math.exp(self.correction(policy).item())
         except DivergenceError:
             return math.inf
 
     def correction(self, policy: nn.Module, *, latest: int = HISTORY) -> Float[Tensor, ""]:
-        """The log m + s²/2 of the expected cost over the twin's, differentiable by the policy's weights.
+        """The log m + s²/2 of the expected cost over the twin's, at most 5, differentiable by the policy's weights.
 
         It is zero while the twin is right, and for state feedback, which is no function of an observation.
 
@@ -228,10 +239,10 @@ class Belief:
         if anchors is None or isinstance(policy, StateFeedback):
             return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
         replays = anchors.replays.latest(latest)
-        apart = (replays.actions(policy) - replays.flown).square().sum(-1)
+        apart = (replays.actions(policy) - replays.flown).square().sum(-1) + replays.explored
         alike = torch.exp(-0.5 * replays.distances() / LENGTH**2).sum(-1)
-        precisions = 1.0 / (alike * (NOISE**2 + anchors.growth * (apart + replays.explored)))
-        return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
+        precisions = 1.0 / (anchors.noise + anchors.growth * alike * apart)
+        return (((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()).clamp(max=DEARER)
 
     @property
     def contradicted(self) -> bool:
@@ -248,60 +259,82 @@ class Belief:
 
     @torch.no_grad()
     def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
-        n = twin.plant.n_steps
-        repeated = [(flown, self.virtual.repeated(flown.trajectory).exogenous) for flown in self.flown]
-        # State feedback is no function of an observation, and a part of an episode has another cost.
-        whole = [
-            pair
-            for pair in repeated
-            if pair[1].shape[1] == n and not isinstance(self._policies[pair[0].role], StateFeedback)
-        ]
-        pairs = zip(self.differences(), self.flown, strict=True)
-        beyond = [abs(d) - 2.0 * EXPLORED * flown.exploration for d, flown in pairs if not math.isnan(d)]
-        if not whole or max(beyond) <= NOISE:
+        known = [
+            (flown, d) for flown, d in zip(self.flown, self.differences(), strict=True) if not math.isnan(d)
+        ]  # state feedback is no function of an observation
+        if not any(beyond(d, flown.exploration) > NOISE for flown, d in known):
             return None
-        if twin not in self._twins:
-            self._twins[twin] = AnchoredTwin(twin)
-        records, inputs = [flown.trajectory for flown, _ in whole], torch.cat([inputs for _, inputs in whole])
-        costs = inputs.new_tensor([flown.cost for flown, _ in whole])
-        policies = [self.policy_of(flown) for flown, _ in whole]
-        replays = AnchoredReplays(self._twins[twin], records, inputs, costs, policies)
-        return Anchors(replays, self._growth(replays.latest(ANCHORS), policies[-ANCHORS:]))
+        whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
+        for flown, d in known:
+            met = self.virtual.repeated(flown.trajectory).exogenous
+            # A part of an episode has another cost, and where the twin blows up nothing is near.
+            if met.shape[1] == twin.plant.n_steps and abs(d) < DEARER:
+                whole.append(flown)
+                inputs.append(met)
+                differences.append(d)
+        if not whole:
+            return None
+        made = self._twins.get(twin)
+        if made is None or made.closure is not twin.closure:
+            made = self._twins[twin] = twin.of(Anchored(twin.plant))
+        replays = AnchoredReplays(
+            self.virtual.twin,
+            made,
+            [flown.trajectory for flown in whole],
+            torch.cat(inputs),
+            torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),
+            lambda k: self.policy_of(whole[k]),
+        )
+        return Anchors(replays, *self._variances(replays.latest(ANCHORS), whole[-ANCHORS:], differences[-ANCHORS:]))
 
-    def _growth(self, replays: AnchoredReplays, policies: Sequence[nn.Module]) -> float:
-        """The most likely v, by how well each episode predicts the corrections of the others."""
-        rows = list[Tensor]()
-        for policy in policies:
+    def _variances(
+        self, replays: AnchoredReplays, flown: Sequence[Flown], differences: Sequence[float]
+    ) -> tuple[float, float]:
+        """The most likely σ² and v, by how well each episode predicts the corrections of the others.
+
+        Args:
+            replays: anchored replays.
+            flown: their episodes.
+            differences: the paired differences of these.
+        """
+        corrections, others = replays.offsets.new_empty(len(flown), len(flown)), ~torch.eye(len(flown)).bool()
+        for k, episode in enumerate(flown):
             try:
-                rows.append(replays.corrections(policy))
-            except DivergenceError:
-                rows.append(torch.full_like(replays.offsets, DEARER))
-        corrections = torch.stack(rows)
-        met, others = corrections.diag(), ~torch.eye(len(rows), dtype=torch.bool, device=corrections.device)
-        errors = (met.unsqueeze(-1) - corrections)[others].square().clamp(max=DEARER)
-        distances = replays.distances()[others]
-        expected = GROWTH * max(NOISE**2, met.square().mean().item())
+                corrections[k] = replays.corrections(self.policy_of(episode))
+            except DivergenceError:  # of the others, not of the episode itself
+                corrections[k] = DEARER
+                corrections[k, k] = differences[k]
+        met = corrections.diag()
+        errors = (met.unsqueeze(-1) - corrections)[others].clamp(-DEARER, DEARER).square().cpu().numpy()
+        explored = replays.explored + replays.explored.unsqueeze(-1)
+        apart = (replays.distances() + explored)[others].cpu().numpy()
+        noise, growth = NOISE**2, GROWTH * max(NOISE**2, met.square().mean().item())
+        share = 1.0 / max(1, len(flown) - 1)
 
-        def unlikely(log_growth: float) -> float:
-            growth = math.exp(log_growth)
-            variances = 2.0 * NOISE**2 + growth * distances
-            misfit = (variances.log() + errors / variances).sum().item() / max(1, len(rows) - 1)
-            return PRIOR * (log_growth + expected / growth) + misfit
+        def unlikely(logs: np.ndarray) -> float:
+            sigma, v = np.exp(logs)
+            spread = 2.0 * sigma + v * apart
+            misfit = share * (np.log(spread) + errors / spread).sum()
+            return float(misfit + PRIOR * (logs.sum() + noise / sigma + growth / v))
 
-        around = math.log(expected)
-        return math.exp(minimize_scalar(unlikely, bounds=(around - 5.0, around + 5.0), method="bounded").x)
+        start = np.log([noise, growth])
+        bounds = [(start[0], start[0] + 6.0), (start[1] - 5.0, start[1] + 5.0)]
+        sigma, v = np.exp(minimize(unlikely, start, method="L-BFGS-B", bounds=bounds).x)
+        return float(sigma), float(v)
 
     def best_flown(self, like: nn.Module, episodes: Scenario) -> tuple[dict[str, Tensor], Judged] | None:
-        """The weights that are expected to cost least of all that have flown in an architecture; None if none has."""
-        different: list[Flown] = []
-        for one in self.flown[-ANCHORS:]:
-            if not any(equal(one.weights, other.weights) for other in different):
-                different.append(one)
-        flown = [policy for policy in map(self.policy_of, different) if same_architecture(policy, like)]
-        if not flown:
-            return None
-        costs = [self.judge(policy, episodes) for policy in flown]
-        return flown[costs.index(min(costs))].state_dict(), min(costs)
+        """The weights that are expected to cost least of the last that have flown in an architecture; None without."""
+        best: tuple[dict[str, Tensor], Judged] | None = None
+        seen = list[dict[str, Tensor]]()
+        for flown in self.flown[-ANCHORS:]:
+            policy = self.policy_of(flown)
+            if any(equal(flown.weights, weights) for weights in seen) or not same_architecture(policy, like):
+                continue
+            seen.append(flown.weights)
+            judged = self.judge(policy, episodes)
+            if best is None or judged < best[1]:
+                best = copy.deepcopy(policy.state_dict()), judged
+        return best
 
     def require_sound_twin(self, episodes: Scenario) -> None:
         """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
@@ -322,6 +355,11 @@ class Belief:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
         self._differences = self._anchored = None
+
+
+def beyond(d: float, exploration: float) -> float:
+    """Size of a paired difference beyond what the exploration of its episode explains."""
+    return abs(d) if exploration <= QUIET else abs(d) - 2.0 * EXPLORED * exploration
 
 
 def difference(real: float, predicted: float) -> float:

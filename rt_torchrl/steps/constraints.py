@@ -47,9 +47,9 @@ class Constraints:
         return bool(self.bounds.names)
 
     def costs(self, twin: DigitalTwin, policy: nn.Module, episodes: Scenario) -> Float[Tensor, " batch"]:
-        """J_a of virtual episodes with the price of their trajectories, differentiable by the policy's weights."""
-        found = twin.expected_costs(policy, *episodes)
-        return self.priced(found, twin.control(policy, *episodes)) if self else found
+        """The expected costs of virtual episodes and of their price, differentiable by the policy's weights."""
+        found = twin.episode_costs(policy, *episodes)
+        return twin.corrected(policy, self.priced(found, twin.control(policy, *episodes)) if self else found)
 
     def priced(self, costs: Float[Tensor, " batch"], flown: Trajectory) -> Float[Tensor, " batch"]:
         """J_a of trajectories with their price."""

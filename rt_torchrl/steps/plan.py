@@ -48,7 +48,7 @@ class Planner(Protocol):
         """Improve the policy on these virtual episodes; the algorithm then judges it on others.
 
         Returns:
-            Mean J_a on ``episodes`` before and after, the norm of the first gradient, and the number of iterations.
+            Mean cost on ``episodes`` before and after, the norm of the first gradient, and the number of iterations.
 
         Raises:
             DivergenceError: if the twin diverges with the present policy.
@@ -69,6 +69,8 @@ class Planner(Protocol):
 
 class WholeEpisodes:
     r"""Descends :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
+
+    Where real episodes contradict the twin, what it expects on the real system is descended instead.
 
     Args:
         twin: twin with the best closure so far, w_p*.
@@ -211,9 +213,10 @@ class MultiStart:
 
     A descent begins with the present weights. It begins with others, too, in the episodes 1, 2 and 4, and where
     gradients explode in the first plan that gains nothing or is refused, the second, the fourth and so on: with those
-    before the imitation of a controller, with the best of some random policies, and with those that have flown and are
-    expected to cost least. Where the twin is wrong, what has flown stays as it is if it is expected to cost less than
-    every plan.
+    before the imitation of a controller, with the best of some random policies, and with those of the last that have
+    flown and are expected to cost least. Where real episodes contradict the twin, a descent begins with these in every
+    episode in which they are expected to cost less than the present ones, and they stay as they are if they are
+    expected to cost less than every plan.
 
     Note: the paper keeps every plan, as ``single_start`` does. Here a plan made on N_z winds is compared with the
     previous policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another
@@ -283,7 +286,7 @@ class MultiStart:
             self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
-        corrected = self.belief.corrects and self.belief.contradicted
+        corrected = isinstance(self.planner, WholeEpisodes) and self.belief.corrects and self.belief.contradicted
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
         recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < stays else []
         if several or recalled:

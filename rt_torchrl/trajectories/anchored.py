@@ -17,7 +17,7 @@ model along real trajectories (Abbeel, Quigley, Ng, ICML 2006).
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -35,26 +35,26 @@ OBSERVATIONS = 64
 """Greatest number of observations of an episode in which actions are compared."""
 
 
-class _Driven(Extension):
-    """A plant with further inputs, after its own, which only the map of an interval reads; one for each reading.
+class Anchored(Extension):
+    """A plant whose interval ends the increments e further; its inputs are those of the plant, and e.
 
     Args:
         base: the plant of a twin.
     """
 
     own_scheme = True
-    """What is added to an interval as a whole has no vector field."""
-    further = ""
-    """What the further inputs are."""
+    """What is added at the end of an interval is no integral of the vector field."""
 
     def __init__(self, base: Plant):
         super().__init__(base, [])
         self.count = len(base.inputs)
-        added = [Signal(symbol="e", name=f"{self.further}_{signal.name}", unit=signal.unit) for signal in base.readings]
-        self.inputs = (*base.inputs, *added)
+        increments = [Signal(symbol="e", name=f"increment_{signal.name}", unit=signal.unit) for signal in base.readings]
+        self.inputs = (*base.inputs, *increments)
 
-    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
-        return self.base.vector_field(t, state, action, exogenous[..., : self.count], closure)
+    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
+        met, increments = exogenous[..., : self.count], exogenous[..., self.count :]
+        (end, applied), n = self.base.step(t, state, command, met, closure), increments.shape[-1]
+        return Transition(torch.cat([end[..., :n] + increments, end[..., n:]], -1), applied)
 
     def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
         if "exogenous" in given:
@@ -62,112 +62,73 @@ class _Driven(Extension):
         return super().ask(part, method, given)
 
 
-class Anchored(_Driven):
-    """A plant whose interval ends the increments e further; its inputs are those of the plant, and e."""
-
-    further = "increment"
-
-    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
-        met, increments = exogenous[..., : self.count], exogenous[..., self.count :]
-        end, n = self.base.advance(t, state, applied, met, closure), increments.shape[-1]
-        return torch.cat([end[..., :n] + increments, end[..., n:]], -1)
-
-
-class Followed(_Driven):
-    """A plant whose intervals begin with the states that sensors have read; hidden states follow from them."""
-
-    further = "measured"
-
-    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        met, measured = exogenous[..., : self.count], exogenous[..., self.count :]
-        began = torch.cat([measured, state[..., measured.shape[-1] :]], -1)
-        return self.base.step(t, began, command, met, closure)
-
-
-class AnchoredTwin:
-    """A twin beside itself with increments, and with the states that sensors have read.
-
-    Args:
-        twin: the twin; of an ensemble the believed one.
-    """
-
-    def __init__(self, twin: DigitalTwin):
-        self.twin, self.anchored, self.followed = twin, twin.of(Anchored(twin.plant)), twin.of(Followed(twin.plant))
-
-
 class AnchoredReplays:
     """The anchored replays of whole real episodes on a twin with its present closure.
 
     Args:
-        twins: the twin.
+        twin: the twin, whose costs are corrected.
+        anchored: the twin of the :class:`Anchored` plant of ``twin.believed``, under its closure.
         records: what was flown, with the states that sensors read.
         inputs: exogenous inputs of each episode to its horizon, which a record that ended early does not reach.
         costs: J_a of each episode as it was measured, which may be of more than what sensors read.
-        policies: what flew each episode.
+        policy_of: function that gives the policy that flew an episode, by its place among the records.
 
     Attributes:
         flown: the actions of each of these policies, as :meth:`actions` gives them.
         explored: mean square of the actions that each episode had beside those of its policy, in the same unit.
+
+    Raises:
+        DivergenceError: if the believed twin diverges within an interval that begins with what was read.
     """
 
     def __init__(
         self,
-        twins: AnchoredTwin,
+        twin: DigitalTwin,
+        anchored: DigitalTwin,
         records: Sequence[Trajectory],
         inputs: Inputs,
         costs: Costs,
-        policies: Sequence[nn.Module],
+        policy_of: Callable[[int], nn.Module],
     ):
-        self.twins, self.twin, plant = twins, twins.twin, twins.twin.plant
-        self.start: Starts = plant.at_rest(torch.stack([record.states[0] for record in records]))
-        self.low, self.high = bounds(plant.actions, device=inputs.device)
+        self.twin, self.twin_anchored, believed = twin, anchored, twin.believed
+        self.read: Starts = torch.stack([record.states[0] for record in records])
+        self.low, self.high = bounds(twin.plant.actions, device=inputs.device)
         n, increments, counted = inputs.shape[1], [], []
         for record, met in zip(records, inputs, strict=True):
-            states, missed = self._followed(record)
-            increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), missed.shape[-1])]))
+            ends, r = believed.followed(record), record.states.shape[-1]
+            missed = differences(twin.plant.readings, record.states[1:], ends[1:, :r])
+            increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), r)]))
             rest = n - len(record.actions)  # the state in which it ended early
-            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (states, record.actions))
-            counted.append(control_cost(plant, Trajectory(states[None], actions[None], met[None])))
+            known = torch.cat([record.states, ends[:, r:]], -1)
+            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (known, record.actions))
+            counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], met[None])))
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
         self._seen = [self._observed(record) for record in records]
         with torch.no_grad():
-            self.flown = torch.stack([self.actions(policy) for policy in policies])
-            applied = torch.cat([actions for _, _, actions in self._seen])
-            beside = self.flown - self._scaled(applied)
+            self.flown = torch.stack([self.actions(policy_of(k)) for k in range(len(records))])
         counts = [len(actions) for _, _, actions in self._seen]
-        own = [rows.split([n * applied.shape[-1] for n in counts])[k] for k, rows in enumerate(beside)]
+        applied = self._scaled(torch.cat([actions for _, _, actions in self._seen]))
+        own = [row.split([n * len(self.low) for n in counts])[k] for k, row in enumerate(self.flown - applied)]
         self.explored: Costs = torch.stack(
-            [row.square().sum() * len(applied) / n for row, n in zip(own, counts, strict=True)]
+            [row.square().sum() * sum(counts) / n for row, n in zip(own, counts, strict=True)]
         )
 
     def latest(self, count: int) -> "AnchoredReplays":
         """Those of the last episodes, at most as many."""
-        if count >= len(self.start):
+        if count >= len(self.read):
             return self
         found = copy.copy(self)
-        found.start, found.inputs, found.anchored = (x[-count:] for x in (self.start, self.inputs, self.anchored))
+        found.read, found.inputs, found.anchored = (x[-count:] for x in (self.read, self.inputs, self.anchored))
         found.offsets, found.flown, found.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
         return found
-
-    @torch.no_grad()
-    def _followed(self, record: Trajectory) -> tuple[State, Float[Tensor, "n n_r"]]:
-        """The states of an episode, hidden ones as the twin has them, and what the twin does not explain of each."""
-        plant, read = self.twin.plant, record.states
-        driven = torch.cat([record.exogenous, read[:-1]], -1)
-        begins, rows = plant.at_rest(read[:1]), (driven[None], record.actions[None])
-        flown = self.twins.followed.replay(begins, *rows, start=record.start).states[0]
-        r = read.shape[-1]
-        return torch.cat([read, flown[:, r:]], -1), differences(plant.readings, read[1:], flown[1:, :r])
 
     def _observed(self, record: Trajectory) -> tuple[State, Tensor, Action]:
         """Some states of an episode, what policies observe there, and the actions that were flown there."""
         plant, n = self.twin.plant, len(record.actions)
         at = torch.linspace(0, n - 1, min(n, OBSERVATIONS), device=record.states.device).round().long()
-        states = record.states[at]
-        t = record.start + at.double() * plant.dt
-        hidden = plant.at_rest(states)
-        return hidden, plant.observe(t, hidden, record.exogenous[at]), record.actions[at]
+        states, t = plant.at_rest(record.states[at]), record.start + at.double() * plant.dt
+        return states, plant.observe(t, states, record.exogenous[at]), record.actions[at]
 
     def corrections(self, policy: nn.Module) -> Costs:
         r"""The log :math:`c_i = \log\tilde J_i - \log\hat J_i` of what each anchored replay costs over the twin's own.
@@ -178,8 +139,9 @@ class AnchoredReplays:
         Raises:
             DivergenceError: if a replay diverges under the policy.
         """
-        anchored = self.twins.anchored.episode_costs(policy, self.start, self.anchored)
-        return _log_ratio(anchored, self.twin.episode_costs(policy, self.start, self.inputs)) + self.offsets
+        rest, alone = self.twin_anchored.plant.at_rest(self.read), self.twin.plant.at_rest(self.read)
+        anchored = self.twin_anchored.episode_costs(policy, rest, self.anchored)
+        return _log_ratio(anchored, self.twin.episode_costs(policy, alone, self.inputs)) + self.offsets
 
     def actions(self, policy: nn.Module) -> Float[Tensor, " m"]:
         """A policy's actions in some observations of the episodes, of which the squared difference is the mean square.

@@ -26,7 +26,7 @@ from rt_torchrl.programs.contract import Holdings
 from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.engines.parallel import over_all
-from rt_torchrl.trajectories.rollout import Engine, Rollout, able, drive_of, require_double
+from rt_torchrl.trajectories.rollout import Engine, Rollout, able, drive_of, require_double, require_finite
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
@@ -56,6 +56,7 @@ class DigitalTwin:
         self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure)
         self._planned: list[_Planned] = []
+        self._read: ReadInterval | None = None
         self._correction: Callable[[nn.Module], Tensor] | None = None
 
     def of(self, plant: Plant) -> "DigitalTwin":
@@ -76,6 +77,26 @@ class DigitalTwin:
         begins = believed.plant.at_rest(record.states[:1])
         flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
         return flown.states[0, :, : record.states.shape[-1]]
+
+    @torch.no_grad()
+    def followed(self, record: Trajectory) -> Float[Tensor, "samples n_s"]:
+        """The state at the start of a record, and at the end of each interval that begins with what sensors have read.
+
+        The states that no sensor reads are at rest at the start and go on from interval to interval; errors of the twin
+        do not build up in them.
+
+        Raises:
+            DivergenceError: if they diverge all the same.
+        """
+        start = self.plant.at_rest(record.states[:1])
+        held = torch.cat([record.actions, record.states[:-1]], -1)
+        drive = drive_of(self.plant, record.exogenous[None], held[None], start=record.start)
+        # Kept, because the engine compares what is new to it with all that it knows, which takes milliseconds.
+        if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
+            self._read = ReadInterval(self.plant, self.closure, None)
+        ends = Native(compiled=False).end_states(self._read, start, drive)
+        require_finite(self.plant, ends, start, [self.closure])
+        return torch.cat([start, ends[:, 0]])
 
     def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, *, start: Start = 0.0) -> Trajectory:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
@@ -104,14 +125,21 @@ class DigitalTwin:
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))
         return self._planning(policy).costs(initial_state, exogenous)
 
-    def correct(self, correction: Callable[[nn.Module], Tensor]) -> None:
-        """Take what real episodes say of costs: a function of a policy that gives the log of their ratio to its own."""
+    def correct(self, correction: Callable[[nn.Module], Tensor] | None) -> None:
+        """Take what real episodes say of costs: a function of a policy that gives the log of their ratio to its own.
+
+        Args:
+            correction: the function; None for costs as the twin says them.
+        """
         self._correction = correction
 
-    def expected_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
-        """What is expected on the real system of :meth:`episode_costs`; these, where nothing corrects them."""
-        costs = self.episode_costs(policy, initial_state, exogenous)
+    def corrected(self, policy: nn.Module, costs: Costs) -> Costs:
+        """What is expected on the real system where the twin says these costs of a policy."""
         return costs if self._correction is None else costs * self._correction(policy).exp()
+
+    def expected_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
+        """What is expected on the real system of :meth:`episode_costs`, differentiable as these are."""
+        return self.corrected(policy, self.episode_costs(policy, initial_state, exogenous))
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
@@ -163,6 +191,16 @@ class _Planned(NamedTuple):
         """Whether the rollout is of these, and nothing of the closure has changed but the values of its weights."""
         same = plant is self.rollout.plant and closure is self.closure and policy is self.policy
         return same and self.holdings.unchanged(closure)
+
+
+class ReadInterval(Interval):
+    """One control interval that begins with the states that sensors read; the drive's command holds (a, s)."""
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """The state at the end of the interval."""
+        action, read = drive.command.split((len(self.plant.actions), len(self.plant.readings)), -1)
+        known = torch.cat([read, state[..., read.shape[-1] :]], -1)
+        return self.plant.step(drive.t, known, action, drive.exogenous, self.closure).state
 
 
 def constant(module: nn.Module) -> nn.Module:

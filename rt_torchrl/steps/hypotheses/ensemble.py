@@ -23,7 +23,7 @@ ALONE = "as the twin"
 class TwinEnsemble(DigitalTwin):
     r"""A digital twin whose predictions are those of weighted hypotheses.
 
-    .. math:: J(\pi) = (1 - \rho)\sum_h w_hJ_h(\pi) + \rho\max_h J_h(\pi)
+    .. math:: J(\pi) = \sum_h w_hJ_h(\pi)
 
     Each hypothesis is a twin of its own, of a plant that extends the ensemble's. Initial states and records are those
     that sensors read; every hypothesis has its hidden states at rest at the start. Replays and sensitivities are those
