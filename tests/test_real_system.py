@@ -221,6 +221,31 @@ def test_what_does_not_fit_is_refused_before_anything_moves(options, message):
         connected(LinearQuadratic(), rig=rig, **options)
 
 
+def test_each_report_is_read_once():
+    class Ending(LinearQuadratic):
+        end_cost = 10.0
+
+        def ended(self, state):
+            return state[..., 0].abs() > 1e6
+
+    reads = {"state": 0, "exogenous": 0}
+
+    def counting(what):
+        def of(values):
+            reads[what] += 1
+            return values
+
+        return of
+
+    state = dataclasses.replace(STATE, of=counting("state"))
+    system = connected(Ending(horizon=2.0), state=state, exogenous=dataclasses.replace(WIND, of=counting("exogenous")))
+    row = system.reset()
+    reads.update(state=0, exogenous=0)
+    for k in range(1, 4):
+        row = system.step_mdp(system.step(row.set("action", torch.zeros(1, 1).double())))
+        assert reads == {"state": k, "exogenous": k}
+
+
 def test_a_constant_stands_in_for_an_input_that_is_not_reported():
     found = connected(LinearQuadratic(), exogenous=(0.3,)).reset()
     assert found["exogenous"].tolist() == [[0.3]]

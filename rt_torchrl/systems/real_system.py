@@ -310,11 +310,10 @@ class RealSystem(EnvBase):
         if seed is not None and not in_reset:
             self.env.set_seed(seed, static_seed=True)
         self._reported, self._step_count = self.env.reset(**({"seed": seed} if in_reset else {})), 0
+        measured = self._measured(self._reported)
         if self._controller is not None:
-            measured = self._state.read(self._reported, self._read, "state").cpu()
-            self._memory = self._controller.start(measured, self._input(self._reported).cpu())
-        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        return self._entries(applied, ended=False)
+            self._memory = self._controller.start(measured.cpu(), self._input(self._reported).cpu())
+        return self._begun(measured)
 
     @property
     def pace(self) -> Any:
@@ -331,13 +330,16 @@ class RealSystem(EnvBase):
         elif isinstance(self.env, AroundSystem):
             self.env.begin_window()
         self._step_count = 0
+        return self._begun(self._measured(self._reported))
+
+    def _begun(self, measured: Tensor) -> TensorDict:
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        return self._entries(applied, ended=False)
+        return self._entries(self._joined(measured), applied, ended=False)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._episodes += self._step_count == 0
-        before = self._entries(None, ended=False)
+        state, exogenous = self._present
         command = tensordict["action"]
         spec = self.env.full_action_spec[self._actuation.key]
         action = self._actuation.action(command[0]).reshape(spec.shape).to(spec.device, spec.dtype)
@@ -345,44 +347,39 @@ class RealSystem(EnvBase):
         self._step_count += 1
         self._require_reported(stepped["next"])
         if self._applied is None:
-            applied = self.plant.actuate(before["state"], command)
+            applied = self.plant.actuate(state, command)
         else:
             applied = self._applied.read(stepped["next"], self.plant.actions, "applied").to(self.device)
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
-        self._remember(t, before, applied, stepped["next"])
-        over = self.plant.end_cost is not None and self._ended(stepped["next"])
+        measured = self._measured(stepped["next"])
+        if self._controller is not None:
+            interval = t, self._memory, state[:, self._controller.measured], exogenous, applied, measured
+            self._memory = self._controller.advance(*(values.cpu() for values in interval))
+        end = self._joined(measured)
+        over = self.plant.end_cost is not None and bool(self.plant.ended(end).any())
         last = self._step_count >= self.plant.n_steps and not over
         if stepped["next", "done"].any() and not (last or over):
             raise ended_early(stepped["next"], self._step_count, self.plant)
         if (last or over) and hasattr(innermost(self.env), "end_episode"):
             innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
-        cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
-        after = self._entries(applied, ended=last)
+        cost = self.plant.running_cost(t, state, applied, exogenous)
+        after = self._entries(end, applied, ended=last)
         if over:
             after["done"], after["terminated"] = (torch.ones_like(after["done"]) for _ in range(2))
         if last:
             cost = cost + self.plant.terminal_cost(after["state"]) / self.plant.dt
         return after.set("reward", -cost.unsqueeze(-1))
 
-    def _ended(self, found: TensorDictBase) -> bool:
-        """Whether the episode of the plant has ended in the state that the environment reports."""
-        return bool(self.plant.ended(self._state_of(found)).any())
+    def _measured(self, reported: TensorDictBase) -> Tensor:
+        """The states that the environment reports."""
+        return self._state.read(reported, self._read, "state")
 
-    def _state_of(self, found: TensorDictBase) -> Float[Tensor, "1 n_s"]:
+    def _joined(self, measured: Tensor) -> Float[Tensor, "1 n_s"]:
         """The plant's state, of what the environment reports and what the controller has computed."""
-        measured = self._state.read(found, self._read, "state")
         if self._controller is not None:
             measured = self._controller.joined(measured.cpu(), self._memory)
         return measured.to(self.device)
-
-    def _remember(self, t: Tensor, before: TensorDictBase, applied: Tensor, following: TensorDictBase) -> None:
-        """Take the states that the controller computes to the end of an interval."""
-        if self._controller is not None:
-            state, inputs = before["state"].cpu(), before["exogenous"].cpu()
-            measured, end = state[:, self._controller.measured], self._state.read(following, self._read, "state").cpu()
-            now = t.cpu(), self._memory, measured, inputs, applied.cpu(), end
-            self._memory = self._controller.advance(*now)
 
     def _require_reported(self, found: TensorDictBase) -> None:
         """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""
@@ -391,15 +388,14 @@ class RealSystem(EnvBase):
             if isinstance(reading, Reading):
                 reading.require(found, what)
 
-    def _entries(self, applied: Tensor | None, *, ended: bool) -> TensorDict:
+    def _entries(self, state: Tensor, applied: Tensor, *, ended: bool) -> TensorDict:
         """The environment's present report in the plant's terms."""
-        state = self._state_of(self._reported)
         exogenous = self._input(self._reported).to(self.device)
+        self._present = state, exogenous
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
         flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
         found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
-        found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag)}
-        found |= {} if applied is None else {"applied": applied}
+        found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag), "applied": applied}
         found |= {"refused": self._reported["refused"].reshape(1, 1)} if self._judged else {}
         return TensorDict(found, batch_size=self.batch_size, device=self.device)
 
