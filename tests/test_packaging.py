@@ -85,7 +85,7 @@ def test_the_first_command_installs_few_packages():
     """What tests, style, types and documentation need comes only to those who ask for it."""
     found = installed_with(["rt_torchrl"], project())
     assert {"torch", "torchrl", "tensorboard", "tyro"} <= found and len(found) <= 80, sorted(found)
-    assert not {"pytest", "mypy", "basedpyright", "playwright", "jax", "pandas", "onnxruntime", "coolprop"} & found
+    assert not {"pytest", "mypy", "basedpyright", "sphinx", "jax", "pandas", "onnxruntime", "coolprop"} & found
 
 
 @pytest.fixture(scope="module")
