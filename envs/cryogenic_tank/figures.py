@@ -228,7 +228,7 @@ def scene(snapshot: Snapshot) -> Scene:
 
     The tank shows the share of its volume that is liquid, the heat load as an arrow through the wall, and the vent flow
     as puffs behind the valve, as many as its share of the greatest flow of the episode. Beside it stand pressure with
-    its set point, vent flow and load up to the present.
+    its set point, vent flow and load, with a cursor at the present time.
     """
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     state = record.states[:-1]

@@ -135,8 +135,8 @@ def scene(snapshot: Snapshot) -> Scene:
     """The last real episode as an animation.
 
     The rotor is seen from the front. Its blades turn as much slower than the real ones as the episode is quicker, and
-    narrow with the pitch; the arrow is the wind. Beside it stand wind, generator speed, power and pitch up to the
-    present, with the references that the paper's cost follows.
+    narrow with the pitch; the arrow is the wind. Beside it stand wind, generator speed, power and pitch, with the
+    references that the paper's cost follows and a cursor at the present time.
     """
     plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state, wind, pitch = record.states[:-1], array(record.exogenous[:, 0]), array(record.actions[:, 1])
