@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+import runpy
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from linear_quadratic import LinearQuadratic
 from pydantic import Field
 from test_export_recipe import RECIPES, recipe
 
-from rt_torchrl import rk4_step
+from rt_torchrl import Plant, rk4_step
 from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import File, Limit, Widths, choices, configuration, read_options
@@ -342,6 +343,10 @@ def inside_the_library(config):
     rk4_step(None, None, None)
 
 
+def without_words(config):
+    Plant.vector_field(None, None, None, None, None, None)
+
+
 @pytest.mark.parametrize(
     ("main", "message"), [(gone, "No such file or directory: 'gone.bts'"), (refused, "seed=-1 must be")]
 )
@@ -352,11 +357,24 @@ def test_what_the_user_can_mend_is_told_in_a_line(main, message, monkeypatch):
     assert left.value.code.startswith("error: ") and message in left.value.code
 
 
-@pytest.mark.parametrize(("main", "kind"), [(inside_torch, RuntimeError), (inside_the_library, TypeError)])
+@pytest.mark.parametrize(
+    ("main", "kind"),
+    [(inside_torch, RuntimeError), (inside_the_library, TypeError), (without_words, NotImplementedError)],
+)
 def test_another_error_keeps_its_traceback(main, kind, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["recipe.py"])
     with pytest.raises(kind):
         main_of(Config, main)
+
+
+def test_a_checkout_behind_a_link_tells_in_a_line_too(tmp_path, monkeypatch):
+    (tmp_path / "checkout").mkdir()
+    (tmp_path / "checkout" / "part.py").write_text("def main(config):\n    raise ValueError('mend it')\n")
+    (tmp_path / "link").symlink_to(tmp_path / "checkout")
+    monkeypatch.setattr("rt_torchrl.runs.command_line.OURS", (tmp_path / "checkout",))
+    monkeypatch.setattr(sys, "argv", ["recipe.py"])
+    with pytest.raises(SystemExit, match="error: mend it"):
+        main_of(Config, runpy.run_path(str(tmp_path / "link" / "part.py"))["main"])
 
 
 def test_an_interrupt_leaves_as_shells_report_it(monkeypatch):

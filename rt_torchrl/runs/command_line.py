@@ -64,10 +64,13 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
 
 
 def _is_for_users(error: Exception) -> bool:
-    """Whether the library or a recipe of its own has raised the error by a statement ``raise``."""
+    """Whether the library or a recipe of its own has raised the error by a statement ``raise``, and says what it is.
+
+    A ``NotImplementedError`` without words, of a method that a class lacks, tells nobody what to mend.
+    """
     *_, last = traceback.extract_tb(error.__traceback__)
-    ours = any(Path(last.filename).is_relative_to(folder) for folder in OURS)
-    return ours and (last.line or "").startswith("raise ")
+    ours = any(Path(last.filename).resolve().is_relative_to(folder) for folder in OURS)
+    return ours and (last.line or "").startswith("raise ") and str(error) != ""
 
 
 HELP, HELP_ALL = ("-h", "--help"), "--help-all"
