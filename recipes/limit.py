@@ -116,7 +116,8 @@ def contenders(
 ) -> Iterator[tuple[str, Contender]]:
     """The clairvoyant optimum and all controllers, as they are found."""
     episodes = UnseenEpisodes(plant, config.episodes, seed=config.seed)
-    episodes.physics = plant if run is None else run.physics
+    if run is not None:
+        episodes.physics, episodes.closure = run.physics, run.true_closure()
     policies = {} if run is None else {role.replace("_", "-"): policy for role, policy in run.policies.items()}
     starts = flown_starts(episodes, known) | {role: episodes.fly(policy).actions for role, policy in policies.items()}
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts

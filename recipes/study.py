@@ -31,7 +31,7 @@ from rt_torchrl.interruption import Interrupted, termination_as_interrupt
 from rt_torchrl.options import AtLeastOne, Count
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.compare import FinishedRun, Row, markdown, with_interval
-from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of
+from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of, worn_closure
 from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings, settings_of, task_of
 from rt_torchrl.steps.config import Arm, Role
 
@@ -256,7 +256,7 @@ class Yardstick:
         if self.kind == "optimum":
             observed = [signal.name for signal in physics_of(config).observations]
             of |= {"policy": config.policy, "hidden": config.hidden, "observations": observed}
-        worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes}
+        worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes, "start": config.start}
         return of | task_of(as_written(config)) | worn
 
     @functools.cached_property
@@ -283,9 +283,7 @@ class Yardstick:
         config = options_of(self.recipe, self.words).effective()
         plant, physics = plant_of(config), physics_of(config)
         episodes = UnseenEpisodes(plant, config.unseen)
-        episodes.physics = physics
-        if (wear := config.wear(plant)) is not None:
-            episodes.closure = wear(config.episodes - 1)
+        episodes.physics, episodes.closure = physics, worn_closure(config, plant, config.episodes)
         costs = self._costs(config, episodes, functools.partial(config.make_policy, physics))
         self.place.mkdir(parents=True, exist_ok=True)
         write_results(self.path, {"of": self.of(), **costs})

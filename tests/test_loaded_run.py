@@ -10,8 +10,9 @@ import sys
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
+from test_classical import PD
 from test_documentation import leave_finished_run
 from test_export_recipe import RECIPES, leave_run, recipe
 from test_hypotheses import Suspecting
@@ -277,6 +278,29 @@ def test_a_recipe_in_a_package_elsewhere_is_imported_by_its_name(evil, monkeypat
     (folder / "config.json").write_text(json.dumps(settings))
     assert type(load_run(folder, plant=LinearQuadratic()).config) is RunConfig
     assert "own_package.recipe" in sys.modules
+
+
+class Worn(RunConfig):
+    """The real system loses a tenth of its stiffness in every episode."""
+
+    def wear(self, plant):
+        weights = torch.tensor(LinearQuadratic.true_closure, dtype=torch.float64)
+        return lambda episode: LinearClosure(0.9**episode * weights)
+
+
+@pytest.mark.parametrize("start", ["random", "controller"])
+def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start):
+    """The flight of the controller wears the system, too, and episodes that were not made do not."""
+    options = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False, "start": start}
+    run = Run(
+        Worn(log_dir=tmp_path, episodes=5, twinning=SMALL, **options),
+        LinearQuadratic(horizon=2.0),
+        first=PD,
+        callbacks=[lambda episodes: "enough" if len(episodes) == 2 else None],
+    )
+    run.train()
+    found = load_run(tmp_path, Worn, plant=LinearQuadratic(horizon=2.0)).true_closure()
+    assert torch.equal(found.matrix, run.unseen.closure.matrix)
 
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):

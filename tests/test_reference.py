@@ -136,11 +136,15 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
 
 
 def test_a_run_has_its_own_cost_and_command(tmp_path):
-    config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=7200.0)
+    """The system is what wear has made of it in the controller's flight and three episodes."""
+    options = {"command": "duty", "end_weight": 7200.0, "horizon": 7200.0, "model_error": True, "start": "controller"}
+    config, _ = leave_run(tmp_path / "run", "cryogenic_tank", **options)
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps({"episodes": [{}] * 3}))
     found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",), mpc_horizon=3600.0), config.plant()
     planned = ["MPC, exact, held", "MPC, fitted, held"]
     assert list(found) == ["clairvoyant", "on-off", "PI", "model-based", "model-free", *planned]
     episodes = UnseenEpisodes(plant, 2)
+    episodes.closure = config.wear(plant)(3)
     judged = episodes.judge(episodes.fly_baseline(OnOffValve(plant)))
     assert found["on-off"]["costs"] == judged.control_costs.tolist()
     assert min(map(mean, found.values())) == mean(found["clairvoyant"])

@@ -17,7 +17,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
+from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant, worn_closure
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
 from rt_torchrl.steps.config import Role
@@ -130,7 +130,7 @@ class LoadedRun:
                 "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
             )
         believed = self.twin.believed
-        plant, closure = (self.plant, self._true_closure()) if on == "real" else (believed.plant, believed.closure)
+        plant, closure = (self.plant, self.true_closure()) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
         single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
         batches = ((exogenous, 3), (initial_state, 2))
@@ -176,10 +176,11 @@ class LoadedRun:
             raise ValueError(f"role={role!r} does not exist in this run; choose {known}, or run.live.")
         return self.policies[role]
 
-    def _true_closure(self) -> nn.Module:
-        """The real system's closure at the end of the training: a system that wears is not what it was."""
-        wear = self.config.wear(self.plant)
-        return self.plant.closure if wear is None else wear(self.config.effective().episodes - 1)
+    def true_closure(self) -> nn.Module:
+        """The closure of ``plant`` at the end of the training: a system that wears is not what it was."""
+        if self.config.wear(self.plant) is None:
+            return self.plant.closure
+        return worn_closure(self.config, self.plant, len(self.metrics["episodes"]))
 
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
         """Every figure of a finished run by name, with an episode of its own; see :meth:`LoadedRun.figure`."""

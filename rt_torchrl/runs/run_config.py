@@ -398,6 +398,12 @@ def physics_of(config: RunConfig) -> Plant:
     return config.believed() or plant_of(config)
 
 
+def worn_closure(config: RunConfig, plant: Plant, episodes: int) -> nn.Module:
+    """The real system's closure after training episodes, and the flight of a controller that they began with."""
+    wear, flights = config.wear(plant), episodes + (config.start in ("controller", "mpc"))
+    return plant.closure if wear is None else wear(flights - 1)
+
+
 def require_plant(argument: str, given: object) -> None:
     """Refuse what is no plant, such as a class of plants.
 
