@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import socket
+import sys
 import threading
 import time
 
@@ -234,6 +235,22 @@ def test_a_link_to_nobody_says_that_the_plant_does_not_answer(protocol):
         with pytest.raises(LinkLostError):
             work()
     link.close()
+
+
+SIDES = {
+    "server": lambda protocol: ServerProcess(PLANT, (0.0,), protocol=protocol, port=5020, period=0.1),
+    "client": lambda protocol: served_system(PLANT, safe=(0.0,), protocol=protocol, period=0.1),
+}
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_protocol_that_nobody_speaks_or_whose_package_is_not_there_is_refused(side, monkeypatch):
+    with pytest.raises(ValueError, match="protocol='bacnet' does not exist; choose opcua or modbus"):
+        SIDES[side]("bacnet")
+    for protocol, package in (("opcua", "asyncua.sync"), ("modbus", "pymodbus.simulator")):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(ValueError, match=rf"'{protocol}' needs a package \(.*{package}.*install the extra"):
+            SIDES[side](protocol)
 
 
 @pytest.mark.slow

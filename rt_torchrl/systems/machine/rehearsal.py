@@ -17,6 +17,7 @@ tag                   meaning
 """
 
 import asyncio
+import importlib
 import logging
 import math
 import multiprocessing
@@ -239,6 +240,24 @@ class ModbusServer:
 
 SERVERS: dict[str, Callable[[Plant, int], Any]] = {"opcua": OpcUaServer, "modbus": ModbusServer}
 """Servers by the name of their protocol."""
+MODULES = {"opcua": "asyncua.sync", "modbus": "pymodbus.simulator"}
+"""Module of another package that each protocol needs."""
+
+
+def require_protocol(protocol: str) -> None:
+    """Refuse a protocol that does not exist, or whose package is not installed.
+
+    Raises:
+        ValueError: if it is neither opcua nor modbus, or the extra machine is not installed.
+    """
+    if protocol not in MODULES:
+        raise ValueError(f"protocol={protocol!r} does not exist; choose {' or '.join(MODULES)}.")
+    try:
+        importlib.import_module(MODULES[protocol])
+    except ImportError as error:
+        raise ValueError(
+            f"protocol={protocol!r} needs a package ({error}): install the extra, pip install 'rt_torchrl[machine]'."
+        ) from error
 
 
 async def serve(
@@ -291,18 +310,10 @@ class ServerProcess:
     """
 
     def __init__(self, plant: Plant, safe: Sequence[float], *, protocol: str, port: int, period: float, seed: int = 0):
-        if protocol not in SERVERS:
-            raise ValueError(f"protocol={protocol!r} does not exist; choose {' or '.join(SERVERS)}.")
+        require_protocol(protocol)
         if not 0 < port < 65536:
             raise ValueError(f"port={port} must lie in 1 ... 65535.")
         ServedPlant(plant, safe, seed=seed)
-        try:
-            SERVERS[protocol](plant, port)
-        except ImportError as error:
-            raise ValueError(
-                f"a server of {protocol} needs its package ({error}): install the extra, "
-                "pip install 'rt_torchrl[machine]'."
-            ) from error
         self._arguments, self._port = pickle.dumps((plant, tuple(safe), protocol, port, period, seed)), port
         self._context = multiprocessing.get_context("spawn")
 
@@ -360,20 +371,17 @@ def link_to(protocol: str, plant: Plant, port: int, *, period: float) -> Link:
         period: control period on the wall clock [s].
 
     Raises:
-        ValueError: if the package of the protocol is not installed.
+        ValueError: if there is no such protocol, or its package is not installed.
     """
+    require_protocol(protocol)
     read, written, timeout = read_tags(plant), written_tags(plant), ANSWER * period
-    try:
-        if protocol == "opcua":
-            from asyncua.sync import Client
+    if protocol == "opcua":
+        from asyncua.sync import Client
 
-            client = partial(Client, f"opc.tcp://{HOST}:{port}")
-            return OpcUaLink(client, own_nodes(read), own_nodes(written), timeout=timeout)
-        from pymodbus.client import ModbusTcpClient
-    except ImportError as error:
-        raise ValueError(f"{protocol} needs a package: install the extra, pip install 'rt_torchrl[machine]'.") from (
-            error
-        )
+        client = partial(Client, f"opc.tcp://{HOST}:{port}")
+        return OpcUaLink(client, own_nodes(read), own_nodes(written), timeout=timeout)
+    from pymodbus.client import ModbusTcpClient
+
     tcp = ModbusTcpClient(HOST, port=port, timeout=timeout, retries=0)
     return ModbusLink(tcp, own_registers(read), own_registers(written, WRITTEN_AT))
 
@@ -405,7 +413,8 @@ def served_system(
         patience: time for which a reset waits for the plant to answer [s].
 
     Raises:
-        ValueError: if the served plant does not serve a state that is measured.
+        ValueError: if the served plant does not serve a state that is measured, or there is no such protocol or its
+            package.
     """
     computed = () if served is None else plant.controller_states
     measured = tuple(state for state in plant.readings if state.name not in computed)
