@@ -192,9 +192,8 @@ def system_of(env: EnvBase | Operation) -> EnvBase:
 class Pace:
     """Waits for the beginning of each control interval.
 
-    The attribute ``late`` is by how much the last interval began after it was due [s], and ``missed`` the number of
-    intervals that began a whole period late or later. These are not made up for: the pace goes on from the moment when
-    the late one began.
+    The attribute ``late`` is by how much the last interval began after it was due [s]. An interval that begins a whole
+    period late or later is not made up for: the pace goes on from the moment when it began.
 
     Args:
         period: time from one beginning to the next [s].
@@ -215,7 +214,7 @@ class Pace:
         if not period > 0.0:
             raise ValueError(f"period={period} s of a control loop must be positive.")
         self.period, self._clock, self._sleep = period, clock, sleep
-        self.late, self.missed = 0.0, 0
+        self.late = 0.0
         self._due: float | None = None
 
     def begin(self) -> None:
@@ -235,9 +234,7 @@ class Pace:
             self._sleep(due - now)
             now = self._clock()
         self.late = now - due
-        missed = self.late >= self.period
-        self.missed += missed
-        self._due = now if missed else due
+        self._due = now if self.late >= self.period else due
         return self.late
 
 

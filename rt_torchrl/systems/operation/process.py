@@ -6,7 +6,6 @@ import pickle
 import signal
 import sys
 import threading
-import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -181,7 +180,7 @@ def act(connection: Connection, parts: bytes, state: bytes | None) -> None:
         threading.Thread(target=_receive, args=(connection, orders, crew.policies), daemon=True).start()
         _operate(crew, None if state is None else pickle.loads(state), orders, windows)
     except BaseException as error:  # any error goes to the learner, because nobody sees this one
-        windows.put(("failed", f"{type(error).__name__}: {error}", traceback.format_exc()))
+        windows.put(("failed", f"{type(error).__name__}: {error}"))
     windows.put(None)
     sender.join()
 
