@@ -66,8 +66,18 @@ class Config(Turbine):
         super().__post_init__()
         if self.asynchronous and self.operation.clock != "wall":
             raise ValueError("operation.clock must be wall: a served plant keeps its own time and does not wait.")
-        if self.real != "simulation":
-            raise ValueError(f"real={self.real!r} is another real system; the served one is the simulation.")
+        for option, usual in (("real", "simulation"), ("unknown", ()), ("model_error", False)):
+            value = getattr(self, option)
+            if value != usual:
+                raise ValueError(
+                    f"{option}={value!r} is another real system; the served one is the simulation that its twin knows. "
+                    f"Leave {option} out, or take recipes/wind_turbine.py."
+                )
+        if self.serve and (self.connect or self.act is not None):
+            raise ValueError(
+                "serve=True runs the server alone, and connect and act are options of a client; give them to another "
+                "process."
+            )
 
     @staticmethod
     def usual_operation() -> OperationConfig:

@@ -432,15 +432,20 @@ def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "option", "value"),
+    ("options", "message"),
     [
-        ("served_turbine", "pace", 0.0),
-        ("served_turbine", "port", 0),
+        ({"pace": 0.0}, "pace="),
+        ({"port": 0}, "port="),
+        ({"real": "rosco"}, "real='rosco' is another real system"),
+        ({"unknown": ("pitch",)}, "unknown=.*'pitch'.* is another real system"),
+        ({"model_error": True}, "model_error=True is another real system"),
+        ({"serve": True, "connect": True}, "serve=True runs the server alone"),
+        ({"serve": True, "act": "law.onnx"}, "serve=True runs the server alone"),
     ],
 )
-def test_impossible_options_are_refused(name, option, value):
-    with pytest.raises(ValueError, match=f"{option}="):
-        recipe(name).Config(**{option: value})
+def test_impossible_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        recipe("served_turbine").Config(**options)
 
 
 # What the page "Connect your machine" prints: its example makes a real system that has not connected yet.
