@@ -1,6 +1,5 @@
 """The figures of the paper's section 6 that have described axes or printed numbers, from trainings by its algorithm."""
 
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,8 +33,8 @@ OF_A_RUN = {
     "cryogenic_tank": ("tank", "states", "policy_contours", "heat_exchanger"),  # 21, 22 a to c, 23
 }
 """Figures that every training draws, by name, beside those below."""
-OPTIONS = ("--preset", "paper", "--no-figures")
-"""Options of the trainings."""
+OPTIONS = ("--preset", "paper")
+"""Options of the trainings beside those that each run of a study has."""
 EPISODES = 5
 """Number of unseen episodes in the figures of predictions."""
 START, HOURS = 540e3, 45.0
@@ -218,14 +217,13 @@ def main(config: Config) -> None:
 
     folder = config.log_dir / config.plant
     recipe = Path(__file__).with_name(f"{config.plant}.py")
-    runs = [Training(recipe, OPTIONS, seed, folder / f"seed-{seed}") for seed in config.seeds]
-    if failures := run_all(runs, jobs=config.jobs):
+    trainings = [Training(recipe, OPTIONS, seed, folder / f"seed-{seed}") for seed in config.seeds]
+    if failures := run_all(trainings, jobs=config.jobs):
         raise ValueError("\n".join(failures))
-    metrics = [
-        json.loads((one.folder / "metrics.json").read_text(encoding="utf-8")) | {"seed": one.seed} for one in runs
-    ]
+    runs = [load_run(training.folder) for training in trainings]
+    metrics = [run.metrics | {"seed": run.config.seed} for run in runs]
     costs = [one["summary"]["unseen"][f"J_a_{one['summary']['live']}"]["mean"] for one in metrics]
-    run = load_run(runs[int(np.argsort(costs)[len(costs) // 2])].folder)  # the seed with the median cost
+    run = runs[int(np.argsort(costs)[len(costs) // 2])]  # that of the median cost
     drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     drawn["prediction"] = prediction(run)
     said = [table(config.plant, metrics)]

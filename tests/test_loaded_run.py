@@ -395,5 +395,5 @@ def test_the_table_has_a_row_for_each_episode(run):
 
 
 def test_without_results_the_message_names_the_file(run, tmp_path):
-    with pytest.raises(ValueError, match=r"metrics.json cannot be read"):
+    with pytest.raises(ValueError, match=r"has no metrics.json: it is not finished"):
         dataclasses.replace(run, folder=tmp_path).table()

@@ -139,7 +139,7 @@ def test_a_run_has_its_own_cost_and_command(tmp_path):
     """The system is what wear has made of it in the controller's flight and three episodes."""
     options = {"command": "duty", "end_weight": 7200.0, "horizon": 7200.0, "model_error": True, "start": "controller"}
     config, _ = leave_run(tmp_path / "run", "cryogenic_tank", **options)
-    (tmp_path / "run" / "metrics.json").write_text(json.dumps({"episodes": [{}] * 3}))
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps({"episodes": [{}] * 3, "summary": {}}))
     found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",), mpc_horizon=3600.0), config.plant()
     planned = ["MPC, exact, held", "MPC, fitted, held"]
     assert list(found) == ["clairvoyant", "on-off", "PI", "model-based", "model-free", *planned]

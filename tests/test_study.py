@@ -5,6 +5,7 @@ import json
 import math
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -161,6 +162,14 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
     assert numbers["rows"][names[1]]["J_a_ratio"]["ratio"] == 1.0 and numbers["rows"][names[2]]["J_a_ratio"] is None
     assert len(comparison_figure([found], "t").axes) == 2
+
+
+def test_a_comparison_waits_for_no_torchrl(tmp_path):
+    folders = [str(leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 2.0])) for seed in (0, 1)]
+    code = "import sys, rt_torchrl; rt_torchrl.compare_runs(sys.argv[1:]); print('torchrl' in sys.modules)"
+    command = [sys.executable, "-c", code, *folders]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=TINY.parents[1])
+    assert done.stdout.strip() == "False"
 
 
 def test_runs_that_cannot_be_compared_are_refused(tmp_path):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics
 from rt_torchrl.runs.settings import BESIDE, BESIDE_TRAINING, flat, read_settings, task_of
 from rt_torchrl.steps.config import Role
 
@@ -91,16 +92,8 @@ class FinishedRun:
             ValueError: if the folder holds no finished run, its results are damaged, or it was judged on its own twin
                 alone.
         """
-        from rt_torchrl.runs.results import judged_on_the_system, on_the_twin  # here, because it loads TorchRL
-
-        settings, file = read_settings(folder), folder / "metrics.json"
-        if not file.is_file():
-            raise ValueError(f"the run in {folder} has no metrics.json: it is not finished; go on with it by --resume.")
-        try:
-            metrics = json.loads(file.read_text(encoding="utf-8"))
-            summary, episodes = metrics["summary"], metrics["episodes"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{file} is damaged: {error!r}") from error
+        settings, metrics = read_settings(folder), read_metrics(folder)
+        summary, episodes = metrics["summary"], metrics["episodes"]
         unseen, live = judged_on_the_system(summary)
         judged = all("J_a_unseen" in episode for episode in episodes)
         return cls(

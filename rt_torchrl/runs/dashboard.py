@@ -13,7 +13,8 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
-from rt_torchrl.runs.results import on_the_twin, progress
+from rt_torchrl.runs.metrics import on_the_twin
+from rt_torchrl.runs.results import progress
 from rt_torchrl.runs.run_config import LoggerName
 from rt_torchrl.steps.config import Role
 

@@ -1,7 +1,6 @@
 """A finished run in code: its plant, policies, closure and results, what-if episodes and figures."""
 
 import copy
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant, worn_closure
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
@@ -67,12 +67,7 @@ class LoadedRun:
         Raises:
             ValueError: if the folder holds no ``metrics.json``, or a damaged one.
         """
-        file = self.folder / "metrics.json"
-        try:
-            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise ValueError(f"{file} cannot be read ({error}); a training writes it at its end.") from error
-        return found
+        return read_metrics(self.folder)
 
     @property
     def live(self) -> Role:

@@ -1,6 +1,5 @@
 """The real system of a run: in simulation, operated beside the learning, and flown after the training."""
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -24,6 +23,7 @@ from rt_torchrl.evaluation.unseen import (
 )
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import clones
@@ -260,11 +260,9 @@ def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor])
 
 def paid_before(folder: Path) -> list[float | None]:
     """J_a of the flights that earlier ends of a resumed run have made; null stands for one that is not finite."""
-    try:
-        found = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not (folder / "metrics.json").is_file():
         return []
-    before: list[float | None] = found["summary"]["cost_of_learning"].get("judging", [])
+    before: list[float | None] = read_metrics(folder)["summary"]["cost_of_learning"].get("judging", [])
     return before
 
 

@@ -18,16 +18,15 @@ from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
+from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.report import in_words
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-
-ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
 
 def episode_record(found: TensorDict, *, episode: int) -> dict[str, Any]:
@@ -238,41 +237,6 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
         for step, seconds in record["seconds"].items():
             total[step] = total.get(step, 0.0) + seconds
     return total
-
-
-def on_the_twin(unseen: Mapping[str, Any]) -> bool:
-    """Whether the costs on unseen episodes are those of the twin, and not of the real system or its simulation.
-
-    Args:
-        unseen: entry ``unseen`` of the summary; that of an earlier version does not say.
-    """
-    return unseen.get("judged_on") == "twin"
-
-
-def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], Role]:
-    """What the policy of a run has cost on the system, not on the run's own twin, and the role of that policy.
-
-    Returns:
-        The entry ``unseen``, or entries of the same names from the flights on the real system; and the live role,
-        or the live one, which has made these flights.
-
-    Raises:
-        ValueError: if the run was judged on its own twin alone.
-    """
-    unseen = summary["unseen"]
-    if not on_the_twin(unseen):
-        return unseen, summary["live"]
-    real, live = summary.get("real_unseen", {"controllers": {}}), summary["live"]
-    if live not in real["controllers"]:
-        raise ValueError(
-            "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run "
-            "by --resume and --real-unseen, which flies its live policy on the real system."
-        )
-    flown = real["controllers"]
-    others = {name: found for name, found in flown.items() if name != live}
-    merit = {name: found["merit"] for name, found in flown.items()}
-    count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
-    return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live
 
 
 def reference_entry(

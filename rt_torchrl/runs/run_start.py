@@ -1,6 +1,5 @@
 """What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
 from rt_torchrl.runs.run_folder import CHECKPOINT, has_checkpoint
 from rt_torchrl.runs.settings import read_settings
@@ -146,13 +146,9 @@ def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant)
 
 def _live(folder: Path) -> Role:
     """The role that was live at the end of a run."""
-    file = folder / "metrics.json"
-    try:
-        role = json.loads(file.read_text(encoding="utf-8"))["summary"]["live"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{file} does not say which policy was live ({error!r}); take a finished run.") from error
+    role = read_metrics(folder)["summary"].get("live")
     if role not in ROLES:
-        raise ValueError(f"{file} says that {role!r} was live; it must be {' or '.join(ROLES)}.")
+        raise ValueError(f"metrics.json in {folder} says that {role!r} was live; it must be {' or '.join(ROLES)}.")
     return role
 
 

@@ -1,0 +1,61 @@
+"""The file ``metrics.json`` of a run folder: how it is read, and what the policies of the run have cost where."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rt_torchrl.steps.config import Role
+
+
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """The results of a finished run: ``plant``, ``episodes`` and ``summary``.
+
+    Raises:
+        ValueError: if the run is not finished, or its results cannot be read or are damaged.
+    """
+    file = folder / "metrics.json"
+    if not file.is_file():
+        raise ValueError(f"the run in {folder} has no metrics.json: it is not finished; go on with it by --resume.")
+    try:
+        metrics: Any = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{file} is damaged, or cannot be read: {error}") from error
+    if not (isinstance(metrics, dict) and {"episodes", "summary"} <= metrics.keys()):
+        raise ValueError(f"{file} is damaged: it must be an object with episodes and summary.")
+    return metrics
+
+
+def on_the_twin(unseen: Mapping[str, Any]) -> bool:
+    """Whether the costs on unseen episodes are those of the twin, and not of the real system or its simulation.
+
+    Args:
+        unseen: entry ``unseen`` of the summary; that of an earlier version does not say.
+    """
+    return unseen.get("judged_on") == "twin"
+
+
+def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], Role]:
+    """What the policy of a run has cost on the system, not on the run's own twin, and the role of that policy.
+
+    Returns:
+        The entry ``unseen``, or entries of the same names from the flights on the real system; and the live role,
+        or the live one, which has made these flights.
+
+    Raises:
+        ValueError: if the run was judged on its own twin alone.
+    """
+    unseen = summary["unseen"]
+    if not on_the_twin(unseen):
+        return unseen, summary["live"]
+    real, live = summary.get("real_unseen", {"controllers": {}}), summary["live"]
+    if live not in real["controllers"]:
+        raise ValueError(
+            "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run "
+            "by --resume and --real-unseen, which flies its live policy on the real system."
+        )
+    flown = real["controllers"]
+    others = {name: found for name, found in flown.items() if name != live}
+    merit = {name: found["merit"] for name, found in flown.items()}
+    count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
+    return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live
