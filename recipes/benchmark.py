@@ -1,7 +1,6 @@
 """Time an episode's cost and its gradient by each engine; all take turns in one process."""
 
 import itertools
-import json
 import statistics
 import sys
 import time
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl import Engine, Plant, Rollout, SaturatedMLP, Scenario, configuration, main_of, shipped_plants
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.options import AtLeastOne, File, Positive
 from rt_torchrl.trajectories.rollout import refusal
 
@@ -245,9 +245,8 @@ def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
     """Write ``benchmark.json``, and a figure of each plant: times over the horizons at the first N_z."""
     from rt_torchrl.figures.style import caption, legend_below, panels  # here, because --help need not wait for it
 
-    folder.mkdir(parents=True, exist_ok=True)
     content = {"command": sys.argv, "threads": config.threads, "rows": [row._asdict() for row in rows]}
-    (folder / "benchmark.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_results(folder / "benchmark.json", content)
     clock, batch = "CPU" if config.threads == 1 else "wall", config.realisations[0]
     for plant in config.plants:
         title = f"{plant}, {config.policy} policy, threads: {config.threads}\n{clock} time [s]"
@@ -280,6 +279,8 @@ def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | No
         The rows of the table that is printed.
     """
     config = config.effective()
+    if config.output is not None:
+        make_folder("output", config.output)
     torch.set_num_threads(config.threads)
     rows = [row for name in config.plants for row in rows_of(config, name, peers or {})]
     _tell("")

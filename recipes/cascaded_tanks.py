@@ -1,6 +1,5 @@
 """Identify the Cascaded Tanks benchmark from its record: physics, and physics with a perceptron."""
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +25,7 @@ from rt_torchrl import (
     main_of,
     sensors_of,
 )
-from rt_torchrl.atomic_file import write_results
+from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
@@ -152,16 +151,16 @@ def level_figure(record: SensorRecord, readings: Tensor, title: str) -> "Figure"
 def main(config: Config) -> None:
     from rt_torchrl.figures import save_figure
 
+    make_folder("log_dir", config.log_dir)
     benchmark = read_benchmark(config.data)
     records = {"estimation": sensor_record_of(benchmark.voltage, benchmark.level)}
     if config.test:
         records["test"] = sensor_record_of(benchmark.test_voltage, benchmark.test_level)
-    config.log_dir.mkdir(parents=True, exist_ok=True)
     folds = cross_validated(records["estimation"], config)
     prior = min(config.priors, key=lambda prior: folds[f"{prior:g}"])
     law = physics([records["estimation"]], config)
     neural = with_perceptron(law[0].twin.closure, [records["estimation"]], prior, config)
-    results: dict[str, Any] = {"folds": folds, "prior": prior, "config": dataclasses.asdict(config)}
+    results: dict[str, Any] = {"folds": folds, "prior": prior, "config": config}
     print("RMS error of the simulated level [V]\n  over the folds of the estimation record:")
     print("\n".join(f"    {name:<12}{rms:8.4f}" for name, rms in folds.items()))
     print(f"  the folds choose the prior {prior:g}")

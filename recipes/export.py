@@ -23,6 +23,7 @@ from rt_torchrl import (
     load_run,
     main_of,
 )
+from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
 from rt_torchrl.runs.settings import read_settings
@@ -96,10 +97,7 @@ def main(config: Config) -> None:
             f"{model}."
         )
     output = config.output or config.run / "exported"
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"output={output} cannot be written ({error}); choose another.") from error
+    make_folder("output", output)
     for what in config.what:
         for kind in formats:
             if kind in FORMATS[what]:

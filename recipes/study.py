@@ -24,7 +24,7 @@ if __name__ == "__main__":
 import torch
 
 from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
-from rt_torchrl.atomic_file import make_folder, write_results
+from rt_torchrl.atomic_file import make_folder, write_atomically, write_results
 from rt_torchrl.evaluation.limits import exact_optimum, few_starts, limit
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.interruption import Interrupted, termination_as_interrupt
@@ -405,7 +405,7 @@ def write(config: Config, comparisons: Sequence[Comparison]) -> str:
     for comparison in comparisons:
         parts += [f"## {comparison.title}", comparison.table()]
     text = "\n\n".join(parts) + "\n"
-    (config.log_dir / "study.md").write_text(text, encoding="utf-8")
+    write_atomically(config.log_dir / "study.md", text.encode())
     systems = {comparison.title: comparison.numbers() for comparison in comparisons}
     write_results(config.log_dir / "study.json", {"config": config, "systems": systems})
     figure = comparison_figure(comparisons, "$J_a$ of the live policy; line: median of the seeds, band: their range")
