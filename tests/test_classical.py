@@ -12,7 +12,8 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.runs.results import ROLES, judge
+from rt_torchrl.runs.results import flights_of
+from rt_torchrl.steps.config import ROLES
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import control_cost
 
@@ -61,7 +62,7 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
     unseen = UnseenEpisodes(plant, 4)
     unseen.closure = worn
     affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
-    judged = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"PD": PD(plant)})["PD"]
+    judged = unseen.judge(flights_of(unseen, dict.fromkeys(ROLES, affine), {"PD": PD(plant)})["PD"])
     own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
     assert torch.equal(judged.control_costs, control_cost(plant, own))
 
@@ -111,7 +112,7 @@ def test_a_baseline_that_diverges_does_not_take_the_results():
     unseen = UnseenEpisodes(plant, 4)
     affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
     with pytest.warns(UserWarning, match="baseline 'wild' is left out of the results: .* diverged"):
-        found = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"wild": Wild(plant), "PD": PD(plant)})
+        found = flights_of(unseen, dict.fromkeys(ROLES, affine), {"wild": Wild(plant), "PD": PD(plant)})
     assert list(found) == [*ROLES, "PD"]
 
 

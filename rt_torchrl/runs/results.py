@@ -17,6 +17,7 @@ from rt_torchrl.evaluation.limits import Contender, LimitConfig, exact_optimum, 
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
+from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
@@ -56,30 +57,30 @@ def twin_entries(twin: DigitalTwin) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def judge(
-    unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: Mapping[str, Baseline]
-) -> dict[str, Judged]:
-    """Judge both policies by their flights, and fly and judge the classical controllers, on the unseen episodes.
+def flights_of(
+    unseen: UnseenEpisodes, policies: Mapping[Role, nn.Module], baselines: Mapping[str, Baseline]
+) -> dict[str, Trajectory]:
+    """The unseen episodes under both policies and under the classical controllers, by name.
 
     Args:
         unseen: unseen episodes on the real system as it is now.
-        flights: flights of both policies on these episodes.
+        policies: both policies by role.
         baselines: controllers to compare the policies with, by name; one under which the system diverges is left out.
     """
-    judged: dict[str, Judged] = {role: unseen.judge(flights[role]) for role in ROLES}
+    flights: dict[str, Trajectory] = dict(of_each_role(policies, unseen.fly).items())
     for name, law in baselines.items():
         try:
-            judged[name] = unseen.judge(unseen.fly_baseline(law))
+            flights[name] = unseen.fly_baseline(law)
         except DivergenceError as error:  # a controller to compare with must not take the results of a training
             warnings.warn(f"baseline {name!r} is left out of the results: {error}", stacklevel=2)
-    return judged
+    return flights
 
 
 @torch.no_grad()
 def summarise(
     algorithm: ReinforcementTwinning,
     unseen: UnseenEpisodes,
-    flights: dict[Role, Trajectory],
+    flights: dict[str, Trajectory],
     judged: dict[str, Judged],
     initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
@@ -243,7 +244,7 @@ def reference_entry(
     config: RunConfig,
     unseen: UnseenEpisodes,
     make_policy: Callable[[torch.Generator], nn.Module],
-    better: nn.Module,
+    better: Costs,
 ) -> dict[str, Any]:
     """The entry ``reference`` of the summary; nothing without the option ``reference``.
 
@@ -251,36 +252,36 @@ def reference_entry(
         config: options of the run.
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
-        better: the better policy of the training.
+        better: J_a of the better policy of the training on these episodes.
     """
     if not config.reference:
         return {}
     optimum = exact_optimum(unseen, make_policy)
-    known, cost = config.limit() if config.limit_episodes else None, unseen.control_costs(better).mean().item()
+    known = config.limit() if config.limit_episodes else None
     compared = {
         "J_a": optimum.cost,
         "J_a_of_each_start": optimum.costs,
         "J_a_by_gradients": optimum.by_gradients,
-        "better_over_reference": cost / optimum.cost,
+        "better_over_reference": better.mean().item() / optimum.cost,
     }
     if known is not None:
         few = unseen.first(config.limit_episodes)
-        compared |= {"limit": beside_the_limit(few, known, {"optimum": optimum.policy, "better": better})}
+        costs = {"optimum": few.control_costs(optimum.policy), "better": better[: config.limit_episodes]}
+        compared |= {"limit": beside_the_limit(few, known, costs)}
     return {"reference": compared}
 
 
-def beside_the_limit(episodes: UnseenEpisodes, known: LimitConfig, policies: dict[str, nn.Module]) -> dict[str, Any]:
+def beside_the_limit(episodes: UnseenEpisodes, known: LimitConfig, costs: dict[str, Costs]) -> dict[str, Any]:
     """The limit, and what policies and model predictive control cost over it on the same episodes.
 
     Args:
         episodes: the episodes.
         known: how the limit is computed.
-        policies: the policies by name.
+        costs: J_a of policies on these episodes, by name.
     """
     best = limit(episodes, few_starts(episodes, known), hold=known.hold, config=known.descent)
-    costs = {name: episodes.control_costs(policy).mean().item() for name, policy in policies.items()}
     found = {"episodes": len(best.costs), "J_a": best.mean, **entry(best)}
-    found |= {f"{name}_over_limit": cost / best.mean for name, cost in costs.items()}
+    found |= {f"{name}_over_limit": cost.mean().item() / best.mean for name, cost in costs.items()}
     if known.window is None:
         return found
     planned = predictive(episodes, known.window)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
@@ -41,8 +40,7 @@ from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
 from rt_torchrl.runs.settings import as_written, flat
-from rt_torchrl.steps.config import Role
-from rt_torchrl.steps.imitation import of_each_role
+from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
 from rt_torchrl.steps.plan import MakePlanner, make_planner
 from rt_torchrl.steps.start import first_live
@@ -103,14 +101,11 @@ class Drawing:
         return images
 
 
-def first_flights(
-    unseen: UnseenEpisodes, live: Role, policy: nn.Module, baselines: Mapping[str, Baseline]
-) -> dict[str, "Figure"]:
+def first_flights(unseen: UnseenEpisodes, live: Role, flights: Mapping[str, Trajectory]) -> dict[str, "Figure"]:
     """The figure of the first unseen episode under the live policy and the classical controllers."""
-    episode = unseen.first(1)
-    flown = {str(live): episode.fly(policy)}
-    flown |= {name: episode.fly_baseline(law) for name, law in baselines.items()}
-    shown, where = {who: one.each()[0] for who, one in flown.items()}, "on the twin" if unseen.closure is None else ""
+    idle = {role for role in ROLES if role != live}
+    shown = {who: flown.each()[0] for who, flown in flights.items() if who not in idle}
+    where = "on the twin" if unseen.closure is None else ""
     return {"flights": figures.flights(unseen.physics, shown, where=where)}
 
 
@@ -313,16 +308,14 @@ class Run:
             end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
             self._follow_wear()
-            flights = of_each_role(self.algorithm.policies, self.unseen.fly)
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
-            judged = results.judge(self.unseen, flights, laws)
+            flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
+            judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
             real = self._fly_the_real_system(bar)
             metrics = self._results(gap, flights, judged, real)
             if self.config.figures:
                 bar.doing("drawing the figures")
-                live = self.algorithm.referee.live
-                sound = {name: law for name, law in laws.items() if name in judged}
-                flown = first_flights(self.unseen, live, self.algorithm.policies[live], sound)
+                flown = first_flights(self.unseen, self.algorithm.referee.live, flights)
                 where = "on the twin" if self.unseen.judged_on == "twin" else ""
                 unseen = {"unseen": figures.unseen(judged, self.unseen.categories(), where=where)}
                 images = self.drawing.save(self._snapshot(), self.folder / "figures", first=flown, last=unseen)
@@ -416,7 +409,7 @@ class Run:
     def _results(
         self,
         gap: float,
-        flights: dict[Role, Trajectory],
+        flights: dict[str, Trajectory],
         judged: dict[str, Judged],
         real: dict[str, RealFlights],
     ) -> dict[str, Any]:
@@ -427,7 +420,7 @@ class Run:
         if real:
             summary["real_unseen"] = self._real_results(real)
         summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_side.paid(real)])
-        better = self.algorithm.policies[summary["better"]]
+        better = judged[summary["better"]].control_costs
         summary |= results.reference_entry(self.config, self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
         summary["seconds"]["total"] = time.perf_counter() - self.started
