@@ -107,6 +107,13 @@ def test_a_flight_that_diverges_is_refused():
     assert tune(PD(plant), *episodes(plant), evaluations=2, plant=worse).start == torch.inf
 
 
+def test_a_system_whose_closure_nobody_knows_is_flown_by_no_controller():
+    unseen = UnseenEpisodes(LinearQuadratic(horizon=3.0), 2)
+    unseen.closure = None
+    with pytest.raises(ValueError, match="is not known"):
+        unseen.fly_baseline(PD(unseen.plant))
+
+
 def test_a_baseline_that_diverges_does_not_take_the_results():
     plant = LinearQuadratic(horizon=3.0)
     unseen = UnseenEpisodes(plant, 4)

@@ -82,7 +82,7 @@ class UnseenEpisodes:
     """
 
     judged_on = "simulation"
-    """Where the episodes are flown: simulation of the real system, twin, or real system."""
+    """Where the episodes are flown: simulation, simulation of the real system, twin, or real system."""
 
     def __init__(
         self,
@@ -149,13 +149,13 @@ class UnseenEpisodes:
             ValueError: if the controller can only be flown on the real system.
         """
         law = require_classical(law, self.plant)
-        return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
+        return law.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
 
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Costs:
         """J_a of each episode."""
-        if isinstance(policy, StateFeedback):
-            return control_cost(self.plant, self.fly(policy))
+        if self.closure is None or isinstance(policy, StateFeedback):
+            return control_cost(self.flying, self.fly(policy))
         return self.rollout(policy).costs(self.initial_state, self.exogenous)
 
     def validation(self) -> "UnseenEpisodes | None":
@@ -255,10 +255,6 @@ class TwinEpisodes(UnseenEpisodes):
         """
         return self.fly(require_classical(law, self.plant))
 
-    @torch.no_grad()
-    def control_costs(self, policy: nn.Module) -> Costs:
-        return control_cost(self.flying, self.fly(policy))
-
     def validation(self) -> None:
         """No validation episodes, because the referee has compared the policies on the twin already."""
 
@@ -286,30 +282,25 @@ class RealEpisodes(UnseenEpisodes):
         self.closure = None
         self._system, self._count = system, count
 
+    @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
-        return self._flown(policy, self._count)
-
-    def control_costs(self, policy: nn.Module) -> Costs:
-        return control_cost(self.plant, self.fly(policy))
+        """Fly as many episodes on the real system, whose training episodes then go on as if it had not."""
+        kept = self._system.state_dict()
+        self._system.set_seed(UNSEEN_SEED)
+        try:
+            flown = [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(self._count)]
+        finally:
+            self._system.load_state_dict(kept)
+        return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
 
     def validation(self) -> None:
         """No validation episodes, because a real episode may take hours."""
 
     def fly_baseline(self, law: Baseline) -> Trajectory:
-        """As many episodes on the real system."""
+        """Fly as many episodes on the real system with a controller."""
         if isinstance(law, RealController):
             return law.fly_real(self._count, seed=UNSEEN_SEED)
         return self.fly(law)
-
-    @torch.no_grad()
-    def _flown(self, policy: nn.Module, count: int) -> Trajectory:
-        kept = self._system.state_dict()
-        self._system.set_seed(UNSEEN_SEED)
-        try:
-            flown = [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(count)]
-        finally:
-            self._system.load_state_dict(kept)
-        return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""
