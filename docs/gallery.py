@@ -13,7 +13,7 @@ PICTURES = {
         *("unseen.png", "animation.gif"),
     ),
     "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png", "animation.gif"),
-    "cryogenic_tank": ("tank.png", "vent_path.png", "animation.gif"),
+    "cryogenic_tank": ("tank.png", "animation.gif"),
 }
 """Files of each plant that the gallery shows, by the name of its recipe."""
 

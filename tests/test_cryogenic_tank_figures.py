@@ -32,7 +32,7 @@ def panel(figure, caption):
 
 def test_every_figure_is_drawn_within_its_canvas(snapshot):
     drawn = figures.figures_of(snapshot)
-    assert set(drawn) == {"tank", "heat_exchanger", "vent_path", "closure_weights"}
+    assert set(drawn) == {"tank", "heat_exchanger", "closure_weights"}
     for name, figure in drawn.items():
         assert draw(figure)
         assert clipped_texts(figure) == [] and not collisions(figure), name
@@ -121,37 +121,6 @@ def test_heat_exchanger_of_each_closure(snapshot):
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
     assert all("[W]" in ax.get_title(loc="left") for ax in (heat, held))
     assert share.get_xlabel().endswith("[kPa]")
-
-
-def test_vent_path_is_isenthalpic_then_isobaric(snapshot):
-    from CoolProp.CoolProp import PropsSI
-
-    figure, plant = figures.vent_path(snapshot), snapshot.plant
-    p = snapshot.record.states[:-1, 2].mean().item()
-    p_1 = p - snapshot.record.actions.mean().item()
-    (s_1, T_1), (s_2, T_2), (s_3, T_3) = line(figure.axes[1], "_points").get_xydata()
-    h = PropsSI("H", "P", p, "Q", 0, "Hydrogen")
-    # CoolProp's own flash at p_1 and h agrees to its iterations.
-    assert 1e3 * s_1 == pytest.approx(PropsSI("S", "P", p, "Q", 0, "Hydrogen"), rel=1e-7)
-    assert 1e3 * s_2 == pytest.approx(PropsSI("S", "P", p_1, "H", h, "Hydrogen"), rel=1e-7)
-    assert 1e3 * s_3 == pytest.approx(PropsSI("S", "P", p_1, "Q", 1, "Hydrogen"), rel=1e-7)
-    # The plant's table is fitted to 1e-6.
-    table = plant.saturation(torch.tensor([p, p_1], dtype=torch.float64)).T
-    np.testing.assert_allclose([T_1, T_3], table, rtol=2e-6)
-    assert T_2 == T_3
-    # At constant pressure T ds = dh: the area under 2-3 is the heat taken up.
-    heat = PropsSI("H", "P", p_1, "Q", 1, "Hydrogen") - h
-    assert 1e3 * T_3 * (s_3 - s_2) == pytest.approx(heat, rel=1e-7)
-    outlet = next(entry for entry in figure.axes[1].lines if entry.get_label().startswith("outlet"))
-    share = (outlet.get_xdata()[0] - s_2) / (s_3 - s_2)
-    assert outlet.get_label().endswith(f"{share:.3g}") and 0.5 < share < 1.0
-    assert {"specific entropy $s$ [kJ/(kg K)]", "temperature $T$ [K]"} <= draw(figure)
-
-
-def test_vent_path_of_a_shut_valve(snapshot):
-    record = snapshot.record
-    shut = replace(snapshot, record=record._replace(actions=torch.zeros_like(record.actions)))
-    draw(figures.vent_path(shut))
 
 
 def test_closure_weights_with_truth_start_and_units(snapshot):

@@ -7,6 +7,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from seeds_and_numbers import seeded
+from test_extensions import flight
 from test_trajectory import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
@@ -46,14 +47,6 @@ class Exact(LinearQuadratic):
         return torch.cat([state, applied, exogenous + torch.zeros_like(applied)], -1) @ held.T
 
 
-SCHEMES = {
-    "whole": lambda: pushed(LinearQuadratic()),
-    "around an extension": lambda: pushed(LaggedActuator(LinearQuadratic(), "force", 0.4)),
-    "within an extension": lambda: LaggedActuator(pushed(LinearQuadratic()), "force", 0.4),
-    "periodic": lambda: NeuralResidual(Pendulum(), {"angular_speed": 1.0}, inputs=("angle", "torque")),
-}
-
-
 def stirred(closure, scale=0.5):
     """The closure with other weights in its network, whose last layer is zero at first."""
     generator = torch.Generator().manual_seed(2)
@@ -62,18 +55,6 @@ def stirred(closure, scale=0.5):
         for weight in network.parameters():
             weight.add_(scale * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
     return closure
-
-
-def flight(plant, steps=30, batch=2):
-    generator = torch.Generator().manual_seed(3)
-    state = plant.draw_initial_state(batch, generator)
-    exogenous = plant.draw_exogenous(batch, generator)[:, :steps]
-    return state, exogenous, 2.0 * torch.rand(batch, steps, 1, generator=generator, dtype=torch.float64) - 1.0
-
-
-@pytest.mark.parametrize("name", SCHEMES)
-def test_a_plant_with_a_residual_fulfils_the_contract(name):
-    check_plant(SCHEMES[name](), steps=20, traced=False)  # run-time checks of annotations are no part of a graph
 
 
 def test_a_network_that_matters_nowhere_is_still_refused():
@@ -146,31 +127,25 @@ def test_around_another_scheme_it_is_of_second_order():
     assert coarse / fine == pytest.approx(4.0, rel=0.15) and fine < 5e-3
 
 
-@pytest.mark.parametrize("name", ["whole", "around an extension"])
-def test_gradients_are_those_of_backpropagation(name):
-    plant = SCHEMES[name]()
-    generator = torch.Generator().manual_seed(1)
-    closure, policy = stirred(plant.make_closure(generator)), plant.make_policy(generator)
+def test_the_continuous_adjoint_takes_the_sum():
+    plant = pushed(LinearQuadratic())
+    closure, policy = stirred(plant.make_closure(seeded(1))), plant.make_policy(seeded())
     state, exogenous, _ = flight(plant)
     weights = [w for module in (closure, policy) for w in module.parameters()]
-
-    def gradient(engine):
-        cost = Rollout(plant, closure, policy, engine=engine).costs(state, exogenous).sum()
-        return torch.cat([g.flatten() for g in torch.autograd.grad(cost, weights)])
-
-    reference = gradient("autograd")
-    assert (reference != 0.0).all()
-    for engine in ("native", "parallel"):
-        torch.testing.assert_close(gradient(engine), reference, rtol=1e-9, atol=1e-11)
-    if plant.own_scheme:
-        with pytest.raises(ValueError, match="scheme of its own"):
-            gradient("odeint_adjoint")
-    else:  # the continuous adjoint errs by O(dt)
-        assert (gradient("odeint_adjoint") - reference).norm() < 0.02 * reference.norm()
+    reference, found = (
+        parameters_to_vector(
+            torch.autograd.grad(Rollout(plant, closure, policy, engine=engine).costs(state, exogenous).sum(), weights)
+        )
+        for engine in ("autograd", "odeint_adjoint")
+    )
+    assert (found - reference).norm() < 0.02 * reference.norm()  # it errs by O(dt)
+    with pytest.raises(ValueError, match="scheme of its own"):
+        Rollout(pushed(Exact()), closure, policy, engine="odeint_adjoint")
 
 
 def test_an_angle_turns_without_a_jump():
-    plant = SCHEMES["periodic"]()
+    plant = NeuralResidual(Pendulum(), {"angular_speed": 1.0}, inputs=("angle", "torque"))
+    check_plant(plant, steps=20, traced=False)
     closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
     low, high = (torch.tensor([[sign * torch.pi, 1.0]], dtype=torch.float64) for sign in (-1.0, 1.0))
     action, nothing = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
@@ -195,25 +170,17 @@ class Suspecting(LinearQuadratic):
 
 
 class Real(Suspecting):
-    """The oscillator with a force that its twin does not know."""
+    """The oscillator with magnets, whose force −k sin 2x its twin does not know."""
 
-    def __init__(self, force, **options):
+    def __init__(self, strength, **options):
         super().__init__(**options)
-        self.force = force
+        self.strength = strength
 
     def vector_field(self, t, state, action, exogenous, closure):
         field = super().vector_field(t, state, action, exogenous, closure)
-        return torch.stack([field[..., 0], field[..., 1] + self.force(*state.unbind(-1))], -1)
+        return torch.stack([field[..., 0], field[..., 1] - self.strength * torch.sin(2.0 * state[..., 0])], -1)
 
 
-FORCES = {
-    "magnets, −2 sin 2x": lambda x, v: -2.0 * torch.sin(2.0 * x),
-    "strong magnets, −3 sin 2x": lambda x, v: -3.0 * torch.sin(2.0 * x),
-    "cubic damping, −0.3 v³": lambda x, v: -0.3 * v**3,
-    "flutter, 0.8 v − 0.3 v³": lambda x, v: 0.8 * v - 0.3 * v**3,
-    "dry friction, −0.8 tanh 5v": lambda x, v: -0.8 * torch.tanh(5.0 * v),
-    "nothing": lambda x, v: 0.0 * x,
-}
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
 NAMES = ("lags", "late, twice", "position sensor")
 
@@ -256,53 +223,25 @@ def planned(twin, episodes):
     return policy
 
 
-def compared(force, noise=0.0):
-    """Cost of plans on unseen episodes of the real system, and the misfits, with and without the residual."""
-    real = Real(FORCES[force], horizon=10.0)
-    truth, costs, misfits = DigitalTwin(real, real.closure), {}, {}
-    episodes, unseen = drawn(real, 40, seed=1), drawn(real, 200, seed=2)
-    shares = {}
-    twins = {"optimum": (truth, {})}
-    for label, names in (("others", NAMES), ("with it", (*NAMES, FORCE))):
-        twins[label] = learned(real, names, noise)
-    twins["alone"] = twins["others"][0].twins[ALONE], {}
-    for label, (twin, found) in twins.items():
-        costs[label] = truth.cost(planned(twin, episodes), *unseen).item()
-        misfits |= found
-        shares[label] = getattr(twin, "weights", {})
-    print(f"\n{force}, noise {noise}: " + ", ".join(f"{name} {cost:.4f}" for name, cost in costs.items()))
-    print("  misfits: " + ", ".join(f"{name} {value:.2g}" for name, value in misfits.items()))
-    return costs, misfits, shares["with it"]
-
-
-MAGNETS = "magnets, −2 sin 2x"
-
-
 def test_it_explains_a_force_that_no_other_hypothesis_explains():
-    twin, misfits = learned(Real(FORCES[MAGNETS], horizon=10.0), (*NAMES, FORCE))
+    twin, misfits = learned(Real(2.0, horizon=10.0), (*NAMES, FORCE))
     assert twin.weights == {FORCE: 1.0}
     assert misfits[FORCE] < 0.1 * min(value for name, value in misfits.items() if name != FORCE)
 
 
 @pytest.mark.slow
 def test_a_plan_on_what_it_explains_is_the_optimum():
-    costs, _, _ = compared(MAGNETS)
-    gaps = {name: cost / costs["optimum"] - 1.0 for name, cost in costs.items()}
-    assert gaps["with it"] < 0.005 and gaps["others"] > 0.02 and gaps["alone"] > 0.1
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("noise", [0.0, 0.03])
-@pytest.mark.parametrize("force", list(FORCES)[1:])
-def test_its_plans_are_hardly_ever_worse(force, noise):
-    costs, _, weights = compared(force, noise)
-    assert costs["with it"] < 1.02 * min(costs["others"], costs["alone"])
-    assert (weights == {ALONE: 1.0}) == (force == "nothing")
+    real = Real(2.0, horizon=10.0)
+    truth, episodes, unseen = DigitalTwin(real, real.closure), drawn(real, 40, seed=1), drawn(real, 200, seed=2)
+    others, with_it = (learned(real, names)[0] for names in (NAMES, (*NAMES, FORCE)))
+    twins = (truth, with_it, others, others.twins[ALONE])
+    optimum, *costs = (truth.cost(planned(twin, episodes), *unseen).item() for twin in twins)
+    gaps = [cost / optimum - 1.0 for cost in costs]
+    assert gaps[0] < 0.005 and gaps[1] > 0.02 and gaps[2] > 0.1
 
 
 def test_noise_does_not_call_for_it_where_the_plant_is_right():
-    real = Real(FORCES["nothing"], horizon=10.0)
-    twin, misfits = learned(real, (FORCE,), noise=0.03)
+    twin, misfits = learned(Real(0.0, horizon=10.0), (FORCE,), noise=0.03)
     assert twin.weights == {ALONE: 1.0} and misfits[FORCE] == pytest.approx(misfits[ALONE], rel=0.05)
 
 
@@ -322,13 +261,11 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
     closure = plant.make_closure(torch.Generator().manual_seed(0))
     assert name not in make_twin(plant, closure, HypothesesConfig()).twins
     twin = make_twin(plant, closure, HypothesesConfig(which=(name,))).twins[name]
-    generator = torch.Generator().manual_seed(1)
-    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
-    low, high = (torch.tensor([getattr(a, end) for a in plant.actions]).double() for end in ("low", "high"))
-    command, t = (0.5 * (low + high)).expand(2, -1), torch.zeros(2, dtype=torch.float64)
-    steps = [p.step(t, state, command, exogenous, c).state for p, c in ((twin.plant, twin.closure), (plant, closure))]
+    state, exogenous, commands = flight(plant, steps=1)
+    given = torch.zeros(2).double(), state, commands[:, 0], exogenous[:, 0]
+    steps = [p.step(*given, c).state for p, c in ((twin.plant, twin.closure), (plant, closure))]
     assert torch.equal(*steps)
-    other = twin.plant.step(t, state, command, exogenous, stirred(twin.closure)).state
+    other = twin.plant.step(*given, stirred(twin.closure)).state
     moved = {s.name for s, change in zip(plant.states, (other - steps[0]).abs().amax(0), strict=True) if change}
     assert moved - set(plant.controller_states) >= STATES[plant.name]
 

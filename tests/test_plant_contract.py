@@ -14,7 +14,6 @@ from torchrl.envs.utils import check_env_specs
 from rt_torchrl import DelayedActuator, ScaledActuator, Transition, check_plant, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.unknown_systems import SYSTEMS
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
@@ -83,11 +82,8 @@ def fly(plant, *, batch=1, seed=0):
     return episode, policy
 
 
-def test_plants_are_found():
-    assert "wind_turbine" in CLASSES
-
-
 def test_is_named_after_its_folder(kind, plant):
+    assert "wind_turbine" in CLASSES
     assert plant.name == next(name for name, found in CLASSES.items() if found is kind)
     for group in (plant.states, plant.actions, plant.inputs, plant.observations):
         assert all(signal.unit in signal.label for signal in group)
@@ -135,14 +131,6 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     torch.testing.assert_close(cost, -episode["next", "reward"][..., 0].mean(-1), rtol=1e-12, atol=0)
 
 
-def test_reward_is_minus_the_running_cost(plant):
-    episode, _ = fly(plant, batch=3)
-    t = plant.dt * torch.arange(plant.n_steps, dtype=torch.float64)
-    cost = plant.running_cost(t, episode["state"], episode["next", "applied"], episode["exogenous"])
-    torch.testing.assert_close(episode["next", "reward"][..., 0], -cost, rtol=1e-12, atol=1e-15)  # rounding
-    assert (cost >= 0).all()
-
-
 def test_environment_fulfils_its_specs(plant):
     check_env_specs(PlantEnv(plant, batch_size=2, seed=3), seed=3)
 
@@ -176,31 +164,34 @@ for name, kind in CLASSES.items():
 """
 
 
-@pytest.fixture(scope="module")
-def checking():
-    """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
-    return fresh_process.run(CHECK)
-
-
 @pytest.mark.slow
-def test_fulfils_the_contract_and_is_one_graph(plant, checking):
-    assert f"fulfilled by {plant.name}\n" in checking.stdout, checking.stderr[-3000:]
+def test_plants_fulfil_the_contract_and_are_one_graph():
+    """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
+    found = fresh_process.run(CHECK)
+    for name in CLASSES:
+        assert f"fulfilled by {name}\n" in found.stdout, found.stderr[-3000:]
 
 
 # Every plant, policy, closure and extension that is shipped becomes machine code: nothing in it is refused.
 
 
-RECIPES = {
-    "wind_turbine": (("mlp", "paper", "bias", "scheduled"), ("--task engineering", "--observe preview")),
-    "flapping_wing": (("mlp", "paper"), ("--task hop", "--energy 0.1 --tilt 0.1", "--observe phase")),
+RECIPES = ("wind_turbine", "flapping_wing", "cryogenic_tank")
+OPTIONS = {
+    "wind_turbine": (
+        *("--policy mlp", "--policy paper", "--policy bias", "--policy scheduled"),
+        *("--policy mlp --task engineering", "--policy mlp --observe preview"),
+    ),
+    "flapping_wing": (
+        *("--policy mlp", "--policy paper", "--policy mlp --task hop"),
+        *("--policy mlp --energy 0.1 --tilt 0.1", "--policy mlp --observe phase"),
+    ),
     "cryogenic_tank": (
-        ("mlp", "paper"),
-        ("--command drop --end-weight 0", "--observe phase"),
+        *("--policy mlp", "--policy paper"),
+        *("--policy mlp --command drop --end-weight 0", "--policy mlp --observe phase"),
     ),
 }
 """Policies of each plant, and options that change what it computes."""
-POLICIES = [(recipe, policy) for recipe, (policies, _) in RECIPES.items() for policy in policies]
-SETS = [(recipe, options) for recipe, (_, sets) in RECIPES.items() for options in sets]
+SYSTEMS = {recipe: importlib.import_module(f"rt_torchrl.envs.{recipe}.unknown").SYSTEMS for recipe in RECIPES}
 
 
 def configured(recipe, options):
@@ -216,26 +207,17 @@ def require_traced(plant, closure, policy):
         Rollout(plant, closure, policy)(plant.at_rest(read), plant.draw_exogenous(2, generator)[:, :4])
 
 
-@pytest.mark.parametrize(("recipe", "policy"), POLICIES)
-def test_policies_and_closures(recipe, policy):
+@pytest.mark.parametrize(("recipe", "options"), [(recipe, text) for recipe in RECIPES for text in OPTIONS[recipe]])
+def test_policies_closures_costs_and_observations(recipe, options):
     """All closures with the perceptron, and the true one with the other policies."""
-    config, generator = configured(recipe, f"--policy {policy}"), torch.Generator().manual_seed(0)
+    config, generator = configured(recipe, options), torch.Generator().manual_seed(0)
     plant = config.plant()
     closures = [plant.closure, plant.make_closure(generator), plant.make_neural_closure(generator, (4,))]
-    for closure in closures if policy == "mlp" else closures[:1]:
+    for closure in closures if options == "--policy mlp" else closures[:1]:
         require_traced(plant, closure, config.make_policy(plant, generator))
 
 
-@pytest.mark.parametrize(("recipe", "options"), SETS)
-def test_costs_and_observations(recipe, options):
-    config = configured(recipe, f"--policy mlp {options}")
-    plant = config.plant()
-    require_traced(plant, plant.closure, config.make_policy(plant, torch.Generator().manual_seed(0)))
-
-
-@pytest.mark.parametrize(
-    "recipe", ["cryogenic_tank", *(pytest.param(x, marks=pytest.mark.slow) for x in (*RECIPES,)[:2])]
-)
+@pytest.mark.parametrize("recipe", ["cryogenic_tank", *(pytest.param(x, marks=pytest.mark.slow) for x in RECIPES[:2])])
 def test_hypotheses(recipe):
     config, generator = configured(recipe, ""), torch.Generator().manual_seed(0)
     plant = config.plant()

@@ -2,9 +2,9 @@
 
 import math
 
-import fresh_process
 import numpy as np
 import pytest
+import test_extensions as extensions
 import torch
 from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
@@ -14,18 +14,17 @@ from served_plants import served
 from small_runs import SMALL
 from test_classical import PD
 from test_export_controller import InC
+from test_extensions import flight
 from test_real_system import Rig, connected
 
 from rt_torchrl import (
     BiasedSensor,
     DelayedActuator,
     LaggedActuator,
-    NeuralResidual,
     PlantEnv,
     Run,
     RunConfig,
     StackedObservations,
-    UnreadInput,
     export_c,
     export_controller,
     load_run,
@@ -200,31 +199,9 @@ class Timed(LinearQuadratic):
         return {"late": DelayedActuator(self, "force", 2 * self.dt), "lag": LaggedActuator(self, "force", 0.3)}
 
 
-def residual(plant):
-    """The plant with a network that is no longer zero."""
-    found = NeuralResidual(plant, {"velocity": 1.0}, inputs=("force",))
-    with torch.no_grad():
-        for weight in found.closure.own.parameters():
-            weight.copy_(torch.randn(weight.shape, generator=seeded(), dtype=weight.dtype))
-    return found
-
-
-EXTENSIONS = {
-    "none": lambda plant: plant,
-    "lag": lambda plant: LaggedActuator(plant, "force", 0.3),
-    "delay": lambda plant: DelayedActuator(plant, "force", 0.2),
-    "bias": lambda plant: BiasedSensor(plant, "position", 0.4, 0.1, scale=1.0),
-    "unread": lambda plant: UnreadInput(plant, "disturbance", 0.5, [2.0]),
-    "residual": residual,
+EXTENSIONS = {"none": lambda base: base} | {
+    name: extensions.EXTENSIONS[name] for name in ("lag", "delay", "bias", "unread", "residual")
 }
-
-
-def flight(plant, n=12, batch=3):
-    """Initial states, inputs, and commands within the range of the actions."""
-    start, exogenous = plant.draw_initial_state(batch, seeded(1)), plant.draw_exogenous(batch, seeded(2))[:, :n]
-    share = torch.rand(batch, n, len(plant.actions), generator=seeded(3), dtype=torch.float64)
-    low, high = (torch.tensor([getattr(a, end) for a in plant.actions], dtype=torch.float64) for end in ("low", "high"))
-    return start, exogenous, low + share * (high - low)
 
 
 def observed(plant, states, exogenous):
@@ -243,12 +220,12 @@ def by_hand(now, count):
 def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(kind):
     extend, base, engine = EXTENSIONS[kind], Timed(), "native"
     plain = extend(base)
-    start, exogenous, commands = flight(plain)
+    start, exogenous, commands = flight(plain, 12, 3)
     flown = Rollout(plain, plain.closure, engine=engine)(start, exogenous, commands)
     expected = by_hand(observed(plain, flown.states, exogenous), 3)
     for plant in (StackedObservations(plain, 3), extend(StackedObservations(base, 3))):
         assert plant.unread == plain.unread and len(plant.observations) == 8
-        stacked = plant.draw_initial_state(3, seeded(1))
+        stacked = plant.draw_initial_state(3, seeded(3))
         found = Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
         torch.testing.assert_close(observed(plant, found.states, exogenous), expected, rtol=1e-13, atol=1e-13)
         now = observed(plant, found.states, exogenous)[..., :2]
@@ -268,7 +245,7 @@ def test_the_plants_and_all_that_they_suspect(name):
     n_o, readings = len(plant.base.observations), len(plant.states)
     for each in (plant, *suspects.values()):
         assert each.readings == plant.states and each.observations == plant.observations
-        start, exogenous, commands = flight(each, n=4, batch=2)
+        start, exogenous, commands = flight(each, 4)
         with torch.no_grad():
             states = Rollout(each, each.closure, engine="autograd")(start, exogenous, commands).states
         found = observed(each, states, exogenous)
@@ -276,40 +253,6 @@ def test_the_plants_and_all_that_they_suspect(name):
         # A twin begins a replay with what was read.
         again = each.at_rest(states[:, 0, :readings])
         assert torch.equal(again[:, :readings], states[:, 0, :readings])
-
-
-@pytest.mark.parametrize("extend", [EXTENSIONS["none"], EXTENSIONS["lag"]], ids=["none", "lag"])
-def test_gradients_of_native_are_those_of_autograd(extend):
-    plant = extend(StackedObservations(Timed(), 2))
-    policy, (start, exogenous, _) = plant.make_policy(seeded(4)), flight(plant, n=20)
-    closure = plant.make_closure(seeded(5))
-    weights = [*policy.parameters(), *(w for w in closure.parameters() if w.requires_grad)]
-
-    found = []
-    for engine in ("autograd", "native"):
-        cost = Rollout(plant, closure, policy, engine=engine).costs(start, exogenous).mean()
-        found.append(torch.autograd.grad(cost, weights))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-13)
-    assert found[1][0].shape == (1, 6) and (found[1][0] != 0.0).all()
-
-
-CHECK = """
-import sys
-sys.path.insert(0, "tests")
-from test_unread_states import EXTENSIONS, Timed
-from rt_torchrl import StackedObservations, check_plant
-
-for kind in ("none", "delay"):
-    check_plant(EXTENSIONS[kind](StackedObservations(Timed(), 2)), episodes=2, steps=5)
-print("fulfilled")
-"""
-
-
-@pytest.mark.slow
-def test_it_is_one_graph():
-    found = fresh_process.run(CHECK)
-    assert found.stdout == "fulfilled\n", found.stderr[-3000:]
 
 
 class Mass(LinearQuadratic):
@@ -364,7 +307,7 @@ def test_the_controller_in_c_holds_the_past_observations(tmp_path):
 
 def test_past_observations_follow_from_a_log():
     plant = StackedObservations(Timed(), 3)
-    start, exogenous, commands = flight(plant)
+    start, exogenous, commands = flight(plant, 12)
     states = Rollout(plant, plant.closure)(start, exogenous, commands).states[0].detach()
     log = {signal.name: states[:, k] for k, signal in enumerate(LinearQuadratic.states)}
     found = plant.complete_states(log, exogenous[0], commands[0])
@@ -440,34 +383,6 @@ def test_what_the_environment_does_not_report_is_refused_by_its_name():
     base = Timed(horizon=2.0)
     with pytest.raises(ValueError, match="the plant needs .*position_error_1_ago"):
         connected(StackedObservations(base, 1), rig=Rig(base))
-
-
-@pytest.mark.slow
-def test_a_run_on_such_a_real_system_resumes_to_the_bit(tmp_path):
-    base = Timed(horizon=2.0)
-
-    def run(folder, episodes, **options):
-        plant = StackedObservations(base, 2)
-        config = RunConfig(
-            episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures=False, twinning=SMALL, **options
-        )
-        env = connected(plant, rig=Rig(base), computes=True, closure=base.closure)
-        return Run(config, plant, env=env).train()
-
-    assert_same_episodes(*resumed(run, tmp_path, 3))
-
-
-def resumed(run, folder, episodes):
-    """The results of a whole run, and of one that was cut short after an episode."""
-    whole = run(folder / "whole", episodes)
-    run(folder / "parts", 1)
-    return whole, run(folder / "parts", episodes, resume=True)
-
-
-def assert_same_episodes(whole, parts):
-    assert len(whole["episodes"]) > 1
-    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
-        assert {**one, "seconds": None} == {**other, "seconds": None}
 
 
 def test_the_page_runs(tmp_path, monkeypatch):

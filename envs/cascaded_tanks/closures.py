@@ -1,12 +1,10 @@
 r"""Closures of the cascaded tanks: pump, outlets and overflow, and a perceptron beside them."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.closures import BoundedPerceptron, PositiveCoefficients
+from rt_torchrl.plants.closures import CorrectedLaw, PositiveCoefficients
 
 
 class Hydraulics(PositiveCoefficients):
@@ -63,28 +61,19 @@ class Hydraulics(PositiveCoefficients):
         return torch.stack([pumped - down - over, down + self.coefficients[-1] * over - out], -1)
 
 
-class NeuralHydraulics(nn.Module):
+class NeuralHydraulics(CorrectedLaw):
     r"""Hydraulics with a perceptron that corrects both outlets and what reaches the lower tank of the overflow.
 
     .. math:: \dot h_1 = q_0 - q_1 - q_o - N_1, \qquad \dot h_2 = q_1 + eq_o - q_2 + N_1 - N_2
 
     N_1 and N_2 are functions of both levels and the voltage. They are zero at first.
-
-    Args:
-        law: the law that it starts from, which is trained too.
-        hidden: widths of the hidden layers.
-        generator: source of the initial weights.
     """
 
-    ranges = ((0.0, 30.0), (0.0, 10.0), (0.0, 7.0))
-    greatest_flow = 0.03
-    """Greatest correction of a flow [V/s], about a sixth of the mean flow."""
+    law: Hydraulics
 
-    def __init__(self, law: Hydraulics, *, hidden: Sequence[int], generator: torch.Generator):
-        super().__init__()
-        self.law = law
-        bounds = [self.greatest_flow] * 2
-        self.correction = BoundedPerceptron(self.ranges, bounds, hidden=hidden, generator=generator)
+    ranges = ((0.0, 30.0), (0.0, 10.0), (0.0, 7.0))
+    bounds = (0.03, 0.03)
+    """Greatest corrections of a flow [V/s], about a sixth of the mean flow."""
 
     def named_coefficients(self) -> dict[str, Tensor]:
         """The coefficients of the law by name; the perceptron's weights mean nothing by themselves."""

@@ -1,12 +1,10 @@
 r"""Closures of the tank, three constants and a perceptron beside them, and the paper's policy for the vent."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.closures import BoundedPerceptron, PositiveCoefficients
+from rt_torchrl.plants.closures import CorrectedLaw, PositiveCoefficients
 from rt_torchrl.plants.policies import SmoothClip
 from rt_torchrl.plants.signal import Signal
 
@@ -35,40 +33,23 @@ class ConstantCoefficients(PositiveCoefficients):
     true_coefficients = (50.0, 75.0, 500e9)  # paper, section 5.3
     guessed_coefficients = (1.0, 1.0, 10e9)  # where the paper's twin starts, w_p⁰ = [1, 1, 10]
 
-    @classmethod
-    def first_guess(cls, device: torch.device | str = "cpu") -> "ConstantCoefficients":
-        """A closure with the coefficients that the paper's twin starts from."""
-        return cls(torch.tensor(cls.guessed_coefficients, dtype=torch.float64, device=device))
 
-    def forward(self, features: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
-        """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]; they do not depend on the features."""
-        return self.coefficients.expand(*features.shape[:-1], 3)
-
-
-class NeuralCoefficients(nn.Module):
+class NeuralCoefficients(CorrectedLaw):
     r"""Coefficients that depend on the state, each a constant times a factor between 1/2 and 2.
 
     .. math:: (U_s, U_{HX}, K_{JT})_i = C_i\,2^{\tanh N_i(x)}
 
     with the features x of :meth:`CryogenicTank.features`. Both the logarithms of the constants and the perceptron are
     trained: the first guess is wrong by factors of fifty, and the dependence on the state is far weaker.
-
-    Args:
-        constants: constants C that the closure starts from.
-        hidden: width of each hidden layer.
-        generator: source of the perceptron's initial weights.
     """
 
     ranges = ((0.8, 1.2), (0.6, 0.75), (0.0, 2.0), (0.0, 1.0))  # p/p̃, V_l/V_t, (T_s − T)/0.05 K, Δp_V/Δp_max
-
-    def __init__(self, constants: ConstantCoefficients, *, hidden: Sequence[int], generator: torch.Generator):
-        super().__init__()
-        self.constants = constants
-        self.correction = BoundedPerceptron(self.ranges, (1.0,) * 3, hidden=hidden, generator=generator)
+    bounds = (1.0,) * 3
 
     def forward(self, features: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
         """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]."""
-        return self.constants(features) * torch.exp2(self.correction(features))
+        constants: Tensor = self.law(features)
+        return constants * torch.exp2(self.correction(features))
 
 
 class CubicVentLaw(nn.Module):

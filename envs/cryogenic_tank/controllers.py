@@ -33,26 +33,6 @@ class NarrowOnOff(OnOffValve):
     half_band = 200.0
 
 
-class RestingOnOff(OnOffValve):
-    r"""The on-off valve with a clock: it stays shut for the last part of the episode.
-
-    The paper's cost of an episode pays nothing for the pressure at its end. What the last hours of venting would save
-    therefore comes too late. The rest of 12 h is that of the clairvoyant optimum. A plant with a terminal cost has no
-    use for it.
-    """
-
-    gain_units = {"opening": "Pa", "rest": "s"}
-    default_gains = (GREATEST_DROP, 43.2e3)
-    memory_size = 2
-
-    def law(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
-        opening, rest = self.gains.unbind()
-        _, was_open = super().law(state, memory[..., :1], exogenous)
-        t = memory[..., 1:]
-        is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
-        return self.plant.action_of(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
-
-
 class PIValve(ClassicalController):
     r"""A proportional and integral law of the pressure error, with an integral that stops where the valve saturates.
 

@@ -1,4 +1,4 @@
-"""Figures of the cryogenic tank: its days in orbit, vent, coefficients, path of the vented fluid, and an animation."""
+"""Figures of the cryogenic tank: its days in orbit, its heat exchanger, its coefficients, and an animation."""
 
 from typing import Any, cast
 
@@ -9,9 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
-from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
-from rt_torchrl.evaluation.checks import visited_features
+from rt_torchrl.envs.cryogenic_tank.plant import BAND, CryogenicTank
 from rt_torchrl.figures import style
 from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.snapshot import Snapshot
@@ -35,11 +33,9 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     """Every figure of the tank, by name; its ``closure_weights`` replaces the general figure, which knows no units."""
     # A duty cycle has no pressure drops to draw the exchanger over.
     over_drops = [heat_exchanger] if snapshot.plant.actions[0].name == "valve_drop" else []
-    drawn = {figure.__name__: figure(snapshot) for figure in (tank, *over_drops, vent_path)}
+    drawn = {figure.__name__: figure(snapshot) for figure in (tank, *over_drops)}
     if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
         drawn["closure_weights"] = closure_weights(snapshot, LABELS)
-    if not isinstance(snapshot.closure, ConstantCoefficients):
-        drawn["coefficients"] = coefficients(snapshot)
     return drawn
 
 
@@ -134,92 +130,6 @@ def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Ten
     """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
     return p - plant.valve_outlet(p, plant.opening(actions[:, 0])[0])
-
-
-@torch.no_grad()
-def coefficients(snapshot: Snapshot) -> Figure:
-    """U_s, U_HX and K_JT over each feature of the closure, with the other features at their mean in the last episode.
-
-    Curves are pale where the episode did not visit; the axes extend the visited range by half of it on both sides.
-    """
-    plant = cast(CryogenicTank, snapshot.plant)
-    seen = visited_features(plant, snapshot.record)
-    axes_of = (
-        ("pressure [kPa]", 1e-3 * plant.set_point),
-        ("liquid volume [m³]", plant.volume),
-        ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
-        ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
-    )
-    title = f"Coefficients, episode {style.last_episode(snapshot)}\nother features at their mean in the episode"
-    figure, axes = style.panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
-    for column, (label, unit) in enumerate(axes_of):
-        low, high = seen[:, column].min(), seen[:, column].max()
-        reach = 0.5 * (high - low).clamp(min=1e-6)
-        points = seen.mean(0).repeat(121, 1)
-        ends = (low - reach).item(), (high + reach).item()
-        points[:, column] = torch.linspace(*ends, 121, dtype=seen.dtype, device=seen.device)
-        x, inside = unit * points[:, column], (points[:, column] >= low) & (points[:, column] <= high)
-        for name, closure in style.closures(snapshot).items():
-            for ax, values, (_, factor) in zip(axes[:, column], closure(points).T, LABELS.values(), strict=True):
-                ax.plot(array(x), factor * array(values), **style.closure_look(name))
-        for ax, (name, _) in zip(axes[:, column], LABELS.values(), strict=True):
-            ax.set_yscale("log")
-            style.veil(ax, array(x), array(inside))
-            caption(ax, name if column == 0 else "")
-        axes[-1, column].set_xlabel(label)
-    style.legend_below(figure, [axes[0, 0]])
-    return figure
-
-
-@torch.no_grad()
-def vent_path(snapshot: Snapshot) -> Figure:
-    """Temperature over entropy of the vented fluid, at the mean pressure and drop of the last day of the record.
-
-    1: liquid of the tank at p. 2: behind the valve at p_1, same enthalpy. 3: all vapour at p_1, as an endless heat
-    exchanger would leave it; the real one leaves it at the cross, with the share ε of the heat from 2 to 3.
-    """
-    from CoolProp.CoolProp import PropsSI  # here, because it takes a second to load
-
-    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
-    last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
-    states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
-    state, fluid = states.mean(0), plant.saturation.fluid
-    effectiveness = plant.vent(state, plant.action_of(drop)[None], plant.closure).effectiveness.item()
-    p, p_1 = state[2].item(), (state[2] - drop).item()
-
-    def saturated(pressure: Any, quality: float) -> list[Any]:
-        """Entropy, temperature and enthalpy of saturated liquid (0) or vapour (1)."""
-        return [PropsSI(name, "P", pressure, "Q", quality, fluid) for name in "STH"]
-
-    (s_1, T_1, h_1), (s_3, T_3, h_3) = saturated(p, 0.0), saturated(p_1, 1.0)
-    (s_l, T_valve, h_l), (s_v, _, h_v) = (saturated(np.linspace(p, p_1, 21), quality) for quality in (0.0, 1.0))
-    s_valve = s_l + (h_1 - h_l) / (h_v - h_l) * (s_v - s_l)
-    s = 1e-3 * np.array([s_1, s_valve[-1], s_3, s_valve[-1] + effectiveness * (s_3 - s_valve[-1])])
-    # The heights end where CoolProp's saturation solver is still sure to succeed.
-    heights = np.linspace(PropsSI("Ttriple", fluid), PropsSI("Tcrit", fluid) - 0.01, 300)
-    left, right = (1e-3 * PropsSI("S", "T", heights, "Q", quality, fluid) for quality in (0.0, 1.0))
-    title = f"Path of the vented {fluid.lower()}, episode {style.last_episode(snapshot)}"
-    title += rf", mean of the last {len(states) * plant.dt / 3600.0:g} h" + "\n"
-    title += rf"$p$ = {1e-3 * p:.4g} kPa, $\Delta p_V$ = {1e-3 * (p - p_1):.3g} kPa, "
-    title += rf"$T - T_1$ = {T_1 - T_3:.3g} K, $\Delta h_c$ = {1e-3 * (h_3 - h_1):.4g} kJ/kg"
-    figure, ((whole, near),) = style.panels(1, 2, title=title, size=(11.0, 5.0), width_ratios=(1.0, 1.3))
-    for ax, part in ((whole, "whole dome"), (near, "around the vent")):
-        ax.plot([*left, *right[::-1]], [*heights, *heights[::-1]], color="0.55", linewidth=1.3, label="saturation")
-        ax.axhline(T_1, label="liquid in the tank", **REFERENCE_LINE)
-        ax.plot(1e-3 * s_valve, T_valve, color=REAL, linewidth=2.0, label="valve (1-2)")
-        ax.plot(s[1:3], [T_3, T_3], color=TWIN, linewidth=2.0, label="heat exchanger (2-3)")
-        ax.plot(s[:3], [T_1, T_3, T_3], "o", color=REAL, markersize=5, label="_points")
-        outlet = rf"outlet, $\varepsilon$ = {effectiveness:.3g}"
-        ax.plot(s[3:], [T_3], "x", color=REAL, markersize=9, markeredgewidth=1.8, label=outlet)
-        ax.set_xlabel("specific entropy $s$ [kJ/(kg K)]")
-        caption(ax, "temperature $T$ [K]", part)
-    height, width = max(T_1 - T_3, 0.02), s[2] - s[0]
-    near.set(ylim=(T_3 - 0.5 * height, T_1 + 0.5 * height), xlim=(s[0] - 0.06 * width, s[2] + 0.06 * width))
-    near.ticklabel_format(axis="y", useOffset=False)
-    for (name, T, offset), x in zip((("1", T_1, (8, 7)), ("2", T_3, (8, -14)), ("3", T_3, (6, -14))), s, strict=False):
-        near.annotate(name, (x, T), offset, textcoords="offset points", fontsize=11)
-    style.legend_below(figure, [near])
-    return figure
 
 
 @torch.no_grad()

@@ -95,7 +95,6 @@ class Vent(NamedTuple):
 
     flow: Tensor  # ṁ_c [kg/s]
     heat: Tensor  # Q_HX [W], positive: it cools the liquid
-    effectiveness: Tensor  # ε [-]
 
 
 class Conditions(NamedTuple):
@@ -283,8 +282,8 @@ class CryogenicTank(Plant):
         tank, line = (Properties(*(x[..., k] for x in values)) for k in (0, 1))
         slope = Properties(*(x[..., 0] for x in slopes))
         U_s, U_HX, K_JT = closure(self.features(state, action, tank.T)).unbind(-1)
-        flow, heat, effectiveness = open_vent(p - p_1, tank, line, slope.T, U_HX, K_JT)
-        return Conditions(tank, slope, U_s * self.wall_area, Vent(share * flow, share * heat, effectiveness))
+        flow, heat = open_vent(p - p_1, tank, line, slope.T, U_HX, K_JT)
+        return Conditions(tank, slope, U_s * self.wall_area, Vent(share * flow, share * heat))
 
     def vent(self, state: State, action: Action, closure: nn.Module) -> Vent:
         """Vented flow and heat taken in a state, for a pressure drop Δp_V [Pa] or a duty cycle."""
@@ -389,7 +388,8 @@ class CryogenicTank(Plant):
 
     def make_closure(self, generator: torch.Generator) -> ConstantCoefficients:
         """The paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²; nothing is drawn."""
-        return ConstantCoefficients.first_guess(generator.device)
+        guess = ConstantCoefficients.guessed_coefficients
+        return ConstantCoefficients(torch.tensor(guess, dtype=torch.float64, device=generator.device))
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
         """A neural closure that starts at the paper's first guess."""
@@ -429,7 +429,7 @@ def open_vent(drop: Scalar, tank: Properties, line: Properties, T_slope: Scalar,
     latent = line.h_v - tank.h_l
     flow = conductance * drop
     effectiveness = -torch.expm1(-U_HX * EXCHANGER_AREA * secant / (conductance * latent))
-    return Vent(flow, effectiveness * flow * latent, effectiveness)
+    return Vent(flow, effectiveness * flow * latent)
 
 
 def valve_conductance(drop: Scalar, K_JT: Float[Tensor, "*#batch"]) -> Scalar:

@@ -1,13 +1,12 @@
 r"""Closures of the flapping wing for lift and drag of a blade element: a law, and a perceptron beside it."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from rt_torchrl.plants.closures import BoundedPerceptron, PositiveCoefficients
+from rt_torchrl.plants.closures import CorrectedLaw, PositiveCoefficients
 
 
 class QuasiSteadyPolar(PositiveCoefficients):
@@ -39,13 +38,7 @@ class QuasiSteadyPolar(PositiveCoefficients):
 
     @classmethod
     def draw(cls, generator: torch.Generator, *, spread: float = 0.5) -> "QuasiSteadyPolar":
-        """A guess whose coefficients each miss the true ones by a factor uniform on [1 − spread, 1 + spread].
-
-        Raises:
-            ValueError: if ``spread`` is not in [0, 1), where all coefficients stay positive.
-        """
-        if not 0.0 <= spread < 1.0:
-            raise ValueError(f"spread={spread} of QuasiSteadyPolar must be in [0, 1), a fraction of the true values.")
+        """A guess whose coefficients each miss the true ones by a factor uniform on [1 − spread, 1 + spread]."""
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         factor = 1.0 + spread * (2.0 * torch.rand(3, generator=generator, **like) - 1.0)
         return cls(torch.tensor(cls.true_coefficients, **like) * factor)
@@ -57,7 +50,7 @@ class QuasiSteadyPolar(PositiveCoefficients):
         return torch.stack([2.0 * a * sine * cosine, b + 2.0 * c * sine**2], -1)
 
 
-class NeuralPolar(nn.Module):
+class NeuralPolar(CorrectedLaw):
     r"""Lift and drag of a blade element with two equal sides, by a perceptron.
 
     .. math::
@@ -66,20 +59,10 @@ class NeuralPolar(nn.Module):
 
     with the quasi-steady law QS as the start, which is trained too. A flow from the other side, α_e → −α_e, turns the
     lift and leaves the drag. A flow along the chord gives no lift. The drag is positive.
-
-    Args:
-        law: quasi-steady law that the closure starts from.
-        hidden: width of each hidden layer.
-        generator: source of the perceptron's initial weights.
     """
 
     ranges = ((-1.0, 1.0),)  # cos α_e
     bounds = (2.0, 1.0)
-
-    def __init__(self, law: QuasiSteadyPolar, *, hidden: Sequence[int], generator: torch.Generator):
-        super().__init__()
-        self.law = law
-        self.correction = BoundedPerceptron(self.ranges, self.bounds, hidden=hidden, generator=generator)
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """C_L and C_D [-] at (sin α_e, cos α_e)."""

@@ -1,12 +1,13 @@
 """Actuators that lag, ring, act late or do only a share of what they are asked for."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import nn
 
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension, replaced, settled
+from rt_torchrl.plants.extension import Extension, replaced
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Cost, Hidden, State
 from rt_torchrl.plants.signal import Signal, place_of
@@ -15,7 +16,45 @@ LONGEST_DELAY = 64
 """Greatest number of control intervals of a delay: each is a hidden state, which every engine carries along."""
 
 
-class LaggedActuator(Extension):
+class Actuator(Extension):
+    """A plant with an actuator between an action that is asked for and the one that acts on the plant.
+
+    A subclass says by :meth:`respond` what the actuator does. By default the first hidden state acts at the start of an
+    interval, and all hidden states begin an episode at rest.
+
+    Args:
+        base: the plant.
+        action: name of the action.
+        hidden: signals of the hidden states.
+        own: parameters of the true system; None for none.
+
+    Raises:
+        ValueError: if there is no such action.
+    """
+
+    def __init__(self, base: Plant, action: str, hidden: Sequence[Signal] = (), own: nn.Module | None = None):
+        self.place = place_of("action", action, base.actions, base.name)
+        super().__init__(base, hidden, own)
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, hidden[..., 0])
+
+    def rest(self, base: State) -> Hidden:
+        """The state of the action's name, or else the place in the action's range nearest to zero."""
+        signal, names = self.actions[self.place], [state.name for state in self.base.states]
+        if signal.name in names:
+            position = base[..., names.index(signal.name)]
+        else:
+            position = torch.full_like(base[..., 0], min(max(0.0, signal.low), signal.high))
+        return position.unsqueeze(-1).expand(*base.shape[:-1], len(self.states) - len(self.base.states))
+
+
+def _asked(base: Plant, action: str) -> Signal:
+    """The signal of what an actuator is asked for."""
+    return base.actions[place_of("action", action, base.actions, base.name)]
+
+
+class LaggedActuator(Actuator):
     r"""A plant with an actuator that follows what it is asked for through n equal lags, whose time constants sum to T.
 
     .. math:: \frac Tn\dot x_j = x_{j-1} - x_j, \quad j = 1 \dots n, \quad x_0 = a
@@ -39,14 +78,14 @@ class LaggedActuator(Extension):
     def __init__(self, base: Plant, action: str, time_constant: float, *, stages: int = 1):
         if stages < 1:
             raise ValueError(f"stages={stages} of {action} must be at least 1.")
-        self.place, self.stages = place_of("action", action, base.actions, base.name), stages
-        signal, ends = base.actions[self.place], [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
+        self.stages = stages
+        signal, ends = _asked(base, action), [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
         hidden = [
             Signal(symbol=f"{signal.symbol}'{end}", name=f"lagged_{action}{end}", unit=signal.unit) for end in ends
         ]
         names, meanings = {f"{action}_lag": "s"}, {f"{action}_lag": f"time constant of {action}"}
         own = PositiveCoefficients([time_constant], names=names, meanings=meanings, factor=FACTOR)
-        super().__init__(base, hidden, own)
+        super().__init__(base, action, hidden, own)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         steps = self.dt * self.stages / self.coefficients(closure)[0]
@@ -66,11 +105,8 @@ class LaggedActuator(Extension):
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., -1])
 
-    def rest(self, base: State) -> Hidden:
-        return settled(self.base, self.place, base).unsqueeze(-1).expand(*base.shape[:-1], self.stages)
 
-
-class ResonantActuator(Extension):
+class ResonantActuator(Actuator):
     r"""A plant with an actuator that follows what it is asked for as an underdamped oscillator.
 
     .. math:: \ddot x + 2\zeta\omega\dot x + \omega^2x = \omega^2a, \qquad \zeta = \frac{d}{1 + d} < 1
@@ -89,17 +125,16 @@ class ResonantActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, frequency: float, damping: float):
-        self.place = place_of("action", action, base.actions, base.name)
+        signal = _asked(base, action)
         if not 0.0 < damping < 1.0:
             raise ValueError(f"damping={damping} of {action} must lie in (0, 1); use LaggedActuator beyond.")
-        signal = base.actions[self.place]
         position = Signal(symbol=signal.symbol + "'", name=f"resonant_{action}", unit=signal.unit)
         rate = Signal(symbol=rf"\dot{{{signal.symbol}}}'", name=f"rate_of_{action}", unit=f"{signal.unit}/s")
         names = {f"{action}_frequency": "rad/s", f"{action}_damping_odds": "-"}
         meanings = dict(zip(names, (f"natural frequency of {action}", "zeta/(1 - zeta) of it"), strict=True))
         odds = damping / (1.0 - damping)
         own = PositiveCoefficients([frequency, odds], names=names, meanings=meanings, factor=FACTOR)
-        super().__init__(base, [position, rate], own)
+        super().__init__(base, action, [position, rate], own)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         asked, (x, v) = applied[..., self.place], hidden.unbind(-1)
@@ -121,15 +156,12 @@ class ResonantActuator(Extension):
         pull = omega * omega * (applied[..., self.place] - x)
         return torch.stack([v, pull - 2.0 * zeta * omega * v], -1)
 
-    def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, hidden[..., 0])
-
     def rest(self, base: State) -> Hidden:
-        position = settled(self.base, self.place, base)
+        position = super().rest(base)[..., 0]
         return torch.stack([position, torch.zeros_like(position)], -1)
 
 
-class DelayedActuator(Extension):
+class DelayedActuator(Actuator):
     r"""A plant with an actuator that does in each interval what it was asked for n intervals ago.
 
     .. math:: \bar a_k = a_{k-n}
@@ -146,8 +178,7 @@ class DelayedActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, delay: float):
-        self.place, self.intervals = place_of("action", action, base.actions, base.name), round(delay / base.dt)
-        n, signal = self.intervals, base.actions[self.place]
+        n, signal = round(delay / base.dt), _asked(base, action)
         if not (1 <= n <= LONGEST_DELAY and math.isclose(n * base.dt, delay, rel_tol=1e-9)):
             raise ValueError(
                 f"delay={delay} s of {action} must be 1 to {LONGEST_DELAY} control intervals of {base.dt:g} s; "
@@ -157,24 +188,14 @@ class DelayedActuator(Extension):
             Signal(symbol=f"{signal.symbol}_{{-{k}}}", name=f"{action}_{k}_ago", unit=signal.unit)
             for k in range(n, 0, -1)
         ]
-        super().__init__(base, hidden)
+        super().__init__(base, action, hidden)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         under_way = torch.cat([hidden[..., 1:], applied[..., self.place : self.place + 1]], -1)
         return self.acting(hidden, applied), under_way
 
-    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
-        """The mean rates over an interval: a dead time has no differential equation."""
-        return (self.respond(hidden, applied, closure)[1] - hidden) / self.dt
 
-    def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, hidden[..., 0])
-
-    def rest(self, base: State) -> Hidden:
-        return settled(self.base, self.place, base).unsqueeze(-1).expand(*base.shape[:-1], self.intervals)
-
-
-class ScaledActuator(Extension):
+class ScaledActuator(Actuator):
     r"""A plant with an actuator that does :math:`\bar a = ga`, such as one whose supply voltage sags.
 
     It has no hidden states and no parameters that a twin identifies. The range of the action is that of what the
@@ -190,16 +211,16 @@ class ScaledActuator(Extension):
     """
 
     def __init__(self, base: Plant, action: str, gain: float):
-        self.place, self.gain = place_of("action", action, base.actions, base.name), gain
+        self.gain = gain
         if not 0.0 < gain < math.inf:
             raise ValueError(f"gain={gain} of {action} must be positive and finite, such as 0.95 for a loss of 5 %.")
-        super().__init__(base, [])
+        super().__init__(base, action)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, self.gain * applied[..., self.place])
 
 
-class PositionedActuator(Extension):
+class PositionedActuator(Actuator):
     """A plant with an actuator whose position x is where its last action has left it; a subclass says how it moves.
 
     Args:
@@ -215,11 +236,11 @@ class PositionedActuator(Extension):
     """Unit of the size, after that of the action."""
 
     def __init__(self, base: Plant, action: str, size: float):
-        self.place, self.size = place_of("action", action, base.actions, base.name), size
-        signal = base.actions[self.place]
+        self.size, signal = size, _asked(base, action)
         if not 0.0 < size < math.inf:
             raise ValueError(f"size={size} {signal.unit}{self.unit} of {action} must be positive and finite.")
-        super().__init__(base, [Signal(symbol=signal.symbol + "'", name=f"position_of_{action}", unit=signal.unit)])
+        position = Signal(symbol=signal.symbol + "'", name=f"position_of_{action}", unit=signal.unit)
+        super().__init__(base, action, [position])
 
     def moved(self, x: Cost, asked: Cost) -> Cost:
         """The position at the end of an interval in which an action is asked for."""
@@ -234,15 +255,8 @@ class PositionedActuator(Extension):
         end = self.moved(x, asked)
         return replaced(applied, self.place, self.mean(x, end, asked)), end.unsqueeze(-1)
 
-    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
-        """The mean rates over an interval: what sticks or has play follows no differential equation."""
-        return (self.respond(hidden, applied, closure)[1] - hidden) / self.dt
-
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, self.moved(hidden[..., 0], applied[..., self.place]))
-
-    def rest(self, base: State) -> Hidden:
-        return settled(self.base, self.place, base).unsqueeze(-1)
 
 
 class RateLimitedActuator(PositionedActuator):
@@ -262,7 +276,7 @@ class RateLimitedActuator(PositionedActuator):
         return end - 0.5 * moving * (end - x)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, hidden[..., 0])
+        return Actuator.acting(self, hidden, applied)
 
 
 class PlayActuator(PositionedActuator):

@@ -136,6 +136,26 @@ class BoundedPerceptron(nn.Module):
         return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))
 
 
+class CorrectedLaw(nn.Module):
+    """A law and a perceptron that corrects it, both of which are trained; a subclass says how they go together.
+
+    The perceptron is a :class:`BoundedPerceptron`, so that the closure begins as the law.
+
+    Args:
+        law: the law that the closure starts from.
+        hidden: width of each hidden layer.
+        generator: source of the perceptron's initial weights.
+    """
+
+    ranges: tuple[tuple[float, float], ...]
+    bounds: tuple[float, ...]
+
+    def __init__(self, law: nn.Module, *, hidden: Sequence[int], generator: torch.Generator):
+        super().__init__()
+        self.law = law
+        self.correction = BoundedPerceptron(self.ranges, self.bounds, hidden=hidden, generator=generator)
+
+
 def described_weights(closure: nn.Module) -> dict[str, dict[str, str]]:
     """``unit`` and ``meaning`` of each coefficient, by name; none of a closure that does not say what they are."""
     names, meanings = getattr(closure, "names", {}), getattr(closure, "meanings", {})

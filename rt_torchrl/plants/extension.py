@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import PARTS, Plant
-from rt_torchrl.plants.shapes import Action, Cost, Hidden, Input, State, Time
+from rt_torchrl.plants.shapes import Action, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
 
 
@@ -112,8 +112,8 @@ class Extension(Plant):
         return self.acting(hidden, applied), hidden
 
     def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
-        """The rates of the hidden states, whose solution over an interval :meth:`respond` gives."""
-        return torch.zeros_like(hidden)
+        """The rates of the hidden states; by default their mean rates over an interval, of what has no rate."""
+        return (self.respond(hidden, applied, closure)[1] - hidden) / self.dt
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         """The action that acts at the start of an interval, by which its cost is judged; by default the applied one."""
@@ -227,14 +227,6 @@ def _asked(part: str, method: str) -> Callable[..., Any]:
 for _part, _methods in PARTS.items():
     for _method in _methods:
         setattr(Extension, _method, _asked(_part, _method))
-
-
-def settled(plant: Plant, action: int, states: State) -> Cost:
-    """An actuator's position at the start: the state of its name, or else the place in its range nearest to zero."""
-    signal, names = plant.actions[action], [state.name for state in plant.states]
-    if signal.name in names:
-        return states[..., names.index(signal.name)]
-    return torch.full_like(states[..., 0], min(max(0.0, signal.low), signal.high))
 
 
 def replaced(
