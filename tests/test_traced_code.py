@@ -239,12 +239,6 @@ class Derivative(nn.Module):
         return self.gain * change
 
 
-class Counter(Derivative):
-    def forward(self, observation):
-        self.last += 1.0
-        return self.gain * observation[..., :1] + 1e-3 * self.last
-
-
 class Random(Derivative):
     def forward(self, observation):
         return self.gain * observation[..., :1] + 0.1 * torch.rand(1, dtype=torch.float64)
@@ -260,7 +254,6 @@ POLICIES = {
     "recurrent": (Recurrent, rf"policy \(Recurrent\) {AGAIN}.*a state of the plant"),
     "integral": (Summing, r"policy \(Summing\) changes its buffer 'integral'"),
     "derivative": (Derivative, rf"policy \(Derivative\) {AGAIN}"),
-    "counter": (Counter, rf"policy \(Counter\) {AGAIN}"),
     "random": (Random, rf"policy \(Random\) {AGAIN}.*random numbers belong in draw_exogenous"),
     "dropout": (
         lambda: Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)),
