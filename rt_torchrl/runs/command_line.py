@@ -22,6 +22,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 import rt_torchrl.envs
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.console import HELP, PACKAGE
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, OF_THE_CALL, as_written, module_of, named
 from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
@@ -33,7 +34,6 @@ NOISY = ("torchrl", "torch.utils.cpp_extension")
 """Loggers that report the inner work of a library."""
 
 
-PACKAGE = Path(__file__).resolve().parents[1]
 OURS = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
 """Folders of the library, its plants and its recipes, in a checkout as in a wheel."""
 
@@ -73,8 +73,8 @@ def _is_for_users(error: Exception) -> bool:
     return ours and (last.line or "").startswith("raise ") and str(error) != ""
 
 
-HELP, HELP_ALL = ("-h", "--help"), "--help-all"
-"""Words that ask for help: on the options of the recipe and its run, or on all."""
+HELP_ALL = "--help-all"
+"""Word that asks for help on all options, not on those of the recipe and its run alone."""
 MORE = f"{HELP_ALL} also lists the options whose names have dots, such as the parameters of the six steps."
 
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
 from rt_torchrl.runs.run_config import LoggerName
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import ROLES, Role
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
@@ -193,8 +193,7 @@ def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     """Final costs of a run by name; those that are not finite are left out."""
     unseen, paid = summary["unseen"], summary["cost_of_learning"]
     where = " on the twin" if on_the_twin(unseen) else ""
-    roles = ("model_based", "model_free")
-    found = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in roles}
+    found = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in ROLES}
     found[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
     found |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
     flown = summary.get("real_unseen", {}).get("controllers", {})
