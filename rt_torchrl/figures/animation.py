@@ -19,7 +19,7 @@ FRAMES = 125
 """Greatest number of frames: five seconds."""
 RATE = 25
 """Frames per second."""
-DOTS = 72
+DOTS = 70
 """Dots per inch."""
 Draw = Callable[[Axes, int], str]
 """Function that draws a plant into empty axes at the start of a control interval, and returns the note above it."""
