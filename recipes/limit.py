@@ -28,12 +28,11 @@ from rt_torchrl.atomic_file import make_folder, write_results
 from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.evaluation.limits import (
     Contender,
-    classical,
     fitting,
     flown_starts,
     forecasts,
     general_starts,
-    learned,
+    judged,
     limit,
     receding,
 )
@@ -122,10 +121,9 @@ def contenders(
     starts = flown_starts(episodes, known) | {role: episodes.fly(policy).actions for role, policy in policies.items()}
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
     yield "clairvoyant", limit(episodes, chosen, hold=config.hold or known.hold, config=config.descent)
-    for name, controller in known.starts.items():
-        yield name, classical(episodes, controller)
-    for role, policy in policies.items():
-        yield role, learned(episodes, policy)
+    flying = {name: kind(episodes.physics) for name, kind in known.starts.items()} | policies
+    for name, policy in flying.items():
+        yield name, judged(episodes, episodes.fly(policy))
     if known.window is None:
         return
     asked = {"horizon": config.mpc_horizon} if config.mpc_horizon else {}
@@ -139,14 +137,14 @@ def contenders(
 
 
 def header(best: Contender) -> str:
-    """The names of the columns, for the terminal."""
+    """The names of the columns, for the terminal; times are those of a solve of model predictive control."""
     times = f"{'ms, median':>12}{'ms, max':>12}"
     return f"{'':<24}{'J_a':>12}{'over limit':>12}{times}" + "".join(f"  {merit}" for merit in best.merit)
 
 
 def row(name: str, contender: Contender, best: Contender) -> str:
     """Cost, its ratio to the limit, times and merits, for the terminal."""
-    times = contender.milliseconds or {}
+    times = contender.details.get("milliseconds", {})
     shown = "".join(f"{times[key]:>12.3g}" if key in times else f"{'-':>12}" for key in ("median", "max"))
     numbers = "".join(f"  {value:>{len(merit)}.4g}" for merit, value in contender.merit.items())
     return f"{name:<24}{contender.mean:>12.6g}{contender.mean / best.mean:>12.4f}{shown}{numbers}"
@@ -154,10 +152,9 @@ def row(name: str, contender: Contender, best: Contender) -> str:
 
 def evidence_of(best: Contender) -> str:
     """What says that the clairvoyant optimum is one, for the terminal."""
-    gradient, first = best.details["projected_gradient"], best.details["above_the_best_at_first"]
-    starts = [f"{name} {share:.1e} ({first[name]:.1e})" for name, share in best.details["above_the_best"].items()]
-    above = f"starts above it, in brackets after the first of two descents: {', '.join(starts)}"
-    return f"clairvoyant optimum: projected gradient {gradient:.2g}\n{above}"
+    starts = [f"{name} {share:.1e}" for name, share in best.details["above_the_best"].items()]
+    gradient = best.details["projected_gradient"]
+    return f"clairvoyant optimum: projected gradient {gradient:.2g}\nstarts above it: {', '.join(starts)}"
 
 
 if __name__ == "__main__":

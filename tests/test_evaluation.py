@@ -70,7 +70,7 @@ class OnlyReal(RealController):
 def test_a_controller_that_flies_the_real_system_alone_is_not_simulated():
     plant = LinearQuadratic()
     with pytest.raises(ValueError, match="law=OnlyReal can only be flown on a real system; give a ClassicalController"):
-        UnseenEpisodes(plant, 2).fly_baseline(OnlyReal(plant))
+        UnseenEpisodes(plant, 2).fly(OnlyReal(plant))
 
 
 LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582
@@ -123,7 +123,7 @@ def test_the_engineering_task_beats_jonkman_in_all_his_merits(seed):
     unseen = UnseenEpisodes(plant, 16, seed=999)
     with torch.no_grad():
         ours = unseen.judge(unseen.fly(found.policy)).merit
-        his = unseen.judge(unseen.fly_baseline(JonkmanController(plant))).merit
+        his = unseen.judge(unseen.fly(JonkmanController(plant))).merit
     power, travel, over = (
         ours[name].mean().item() / his[name].mean().item()
         for name in ("mean power [MW]", "pitch travel [deg/s]", "speed above rated [rad/s]")

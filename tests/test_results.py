@@ -22,7 +22,7 @@ from test_export_recipe import RECIPES
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.envs.pendulum.plant import UniformRod
-from rt_torchrl.evaluation.unseen import RealEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.closures import described_weights
 from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
@@ -35,7 +35,7 @@ from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 from rt_torchrl.steps.imitation import of_each_role
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def refused(name):
@@ -101,11 +101,10 @@ def test_validation_follows_the_wear_of_the_system():
 
 
 def test_on_a_real_system_the_better_policy_is_the_live_one():
-    referee = Mock(spec=["live"], live="model_free")
-    system = Mock(spec=RealSystem, plant=LinearQuadratic(horizon=2.0))
+    plant, referee = LinearQuadratic(horizon=2.0), Mock(spec=["live"], live="model_free")
     algorithm = Mock(spec=ReinforcementTwinning, referee=referee)
-    assert results.better_of(algorithm, RealEpisodes(system, 2)) == ("model_free", "twin")
-    system.rollout.assert_not_called()
+    unseen = TwinEpisodes(DigitalTwin(plant, plant.closure), plant, 2)
+    assert results.better_of(algorithm, unseen) == ("model_free", "twin")
 
 
 def test_clones_are_flown_once_and_other_policies_each():

@@ -429,7 +429,7 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     """600 s of 11 m/s with 16 % turbulence: some 4.2 MW, as Jonkman's controller, with the speed held at rated."""
     plant = WindTurbine()
     unseen = RealEpisodes(rosco_turbine(plant), 2)
-    found = unseen.fly_baseline(RoscoController(plant))
+    found = unseen.fly(RoscoController(plant))
     assert not capfd.readouterr().out  # a banner for every episode would push the progress bar off the terminal
     power = plant.generator_power(found.states[:, :-1], found.actions)
     assert found.states.shape == (2, plant.n_steps + 1, 6)

@@ -17,14 +17,13 @@ class TrimmedPD(ClassicalController):
     with A_0 = 76.74 deg and β_0 = −12.50 deg, the trim in 1 m/s headwind. Like the policies, it does not measure the
     wind. On a drone that observes its position alone, the speeds are those of the filters of the position.
 
-    The ``placed_gains`` give a point mass two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and g of
-    thrust per radian of β_w. From there :func:`~rt_torchrl.control.classical.tune` on twenty gusts finds steeper gains,
-    with full stroke until the target is near.
+    Gains of 16 deg/m and 16 deg s/m upwards, 23 deg/m and 23 deg s/m forwards give a point mass two poles at 2 rad/s,
+    with 0.25 m/s² of lift per degree of A_φ and g of thrust per radian of β_w. From there the simplex of Nelder and
+    Mead on twenty gusts finds the default gains, with full stroke until the target is near.
     """
 
     plant: FlappingWing
     gain_units = {"K_Pz": "deg/m", "K_Dz": "deg s/m", "K_Px": "deg/m", "K_Dx": "deg s/m"}
-    placed_gains = (16.0, 16.0, 23.0, 23.0)
     default_gains = (571.0, 397.0, 61.5, 44.0)
     trim = (76.74, -12.50)
 

@@ -1,12 +1,10 @@
-"""Classical controllers: laws of the measured state, with or without memory, and the search for their gains.
+"""Classical controllers: laws of the measured state, with or without memory.
 
 Learned policies are compared with them, and they act on a real system before any policy is trained.
 """
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -15,9 +13,9 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Input, Inputs, Memory, Starts, State
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.native import Native
-from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
+from rt_torchrl.trajectories.rollout import drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import RememberingInterval
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 REMEDY = "Use a smaller dt, or gains that hold the system."
 
@@ -42,8 +40,6 @@ class ClassicalController(nn.Module, ABC):
     """Unit of each gain, by name; empty for a law without gains, such as one with a fixed matrix."""
     default_gains: tuple[float, ...] = ()
     """Values of the gains where none are given, in the order of :attr:`gain_units`."""
-    placed_gains: tuple[float, ...] | None = None
-    """Gains by a rule of thumb, if a search should start from them instead of the defaults."""
     memory_size: int = 0
     """Number of entries of the memory, such as an integral or whether a heater is on."""
     low_action: Tensor
@@ -131,61 +127,3 @@ class ClassicalController(nn.Module, ABC):
         states = carries[..., : len(plant.states)].transpose(0, 1)
         command = loop.command(carries[:-1], drive).transpose(0, 1)
         return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)
-
-
-class Tuned(NamedTuple):
-    """Mean J_a at the first gains and at the gains that the search found, and the number of its evaluations."""
-
-    start: float
-    best: float
-    evaluations: int
-
-
-def tune(
-    controller: ClassicalController,
-    initial_state: Starts,
-    exogenous: Inputs,
-    *,
-    evaluations: int = 80,
-    plant: Plant | None = None,
-) -> Tuned:
-    """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
-
-    Between corners of the first simplex one gain doubles.
-
-    Args:
-        controller: the controller; the search starts from its present gains and leaves the best ones in it.
-        initial_state: initial states of the episodes.
-        exogenous: exogenous inputs of the episodes.
-        evaluations: greatest number of evaluations; each flies all episodes.
-        plant: physics of the system that is flown; None for the controller's own plant.
-
-    Raises:
-        ValueError: if the controller has no gains, or an argument is out of its range.
-    """
-    from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
-
-    if not len(controller.log_gains):
-        raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")
-    if evaluations < 1:
-        raise ValueError(f"evaluations={evaluations} must be at least 1.")
-
-    system = controller.plant if plant is None else plant
-
-    @torch.no_grad()
-    def cost(log_gains: np.ndarray) -> float:
-        controller.log_gains.copy_(torch.as_tensor(log_gains, device=controller.log_gains.device))
-        try:
-            value = control_cost(system, controller.fly(initial_state, exogenous, plant=system)).mean().item()
-        except DivergenceError:
-            return np.inf  # a flight that leaves the finite numbers is worse than any other
-        return value if np.isfinite(value) else np.inf
-
-    first = controller.log_gains.detach().cpu().numpy().copy()
-    simplex = np.vstack([first, first + np.log(2.0) * np.eye(len(first))])
-    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-2, "fatol": 1e-4}
-    start = cost(first)
-    found = minimize(cost, first, method="Nelder-Mead", options=options)
-    with torch.no_grad():
-        controller.log_gains.copy_(torch.as_tensor(found.x, device=controller.log_gains.device))
-    return Tuned(start=start, best=float(found.fun), evaluations=int(found.nfev) + 1)

@@ -141,7 +141,6 @@ class Clairvoyant(NamedTuple):
             actuators hold commands back, of the Lagrangian of that limit.
         excess: greatest distance of a command from the action that was applied, in units of its range.
         start_costs: J_a of each episode at the end of the descents from each start, by name.
-        first_costs: the same at the end of the first descent.
         gradients: number of gradients of all episodes together.
     """
 
@@ -150,17 +149,12 @@ class Clairvoyant(NamedTuple):
     gradient: Costs
     excess: float
     start_costs: dict[str, Costs]
-    first_costs: dict[str, Costs]
     gradients: int
 
-    def spread(self, *, first: bool = False) -> dict[str, float]:
-        """Mean J_a of each start over that of the best commands of each episode, minus one.
-
-        Args:
-            first: whether that of the first descent is taken.
-        """
-        best, found = self.costs.mean(), self.first_costs if first else self.start_costs
-        return {name: (costs.mean() / best - 1.0).item() for name, costs in found.items()}
+    def spread(self) -> dict[str, float]:
+        """Mean J_a of each start over that of the best commands of each episode, minus one."""
+        best = self.costs.mean()
+        return {name: (costs.mean() / best - 1.0).item() for name, costs in self.start_costs.items()}
 
 
 class _End(NamedTuple):
@@ -220,20 +214,19 @@ def clairvoyant(
     if hold == 1 and cost.traced and held_back(plant, initial_state):
         descent = partial(_tightened, RelaxedCost(plant, closure, terminal=plant.terminal_cost), episodes)
     nowhere = torch.full((len(initial_state),), torch.inf, dtype=torch.float64)
-    costs, first, ends = dict.fromkeys(starts, nowhere), dict.fromkeys(starts, nowhere), dict[str, _End]()
+    costs, ends = dict.fromkeys(starts, nowhere), list[_End]()
     for name, commands in starts.items():
         # A start from which the plant diverges keeps its infinite cost.
         with contextlib.suppress(FloatingPointError):
-            ended = descent(cost.units(commands), config)
-            ends[name] = _again(descent, config, ended)
-            costs[name], first[name] = ends[name].costs, ended.costs
+            ends.append(_again(descent, config, descent(cost.units(commands), config)))
+            costs[name] = ends[-1].costs
     if not ends:
         raise DivergenceError(f"plant {plant.name!r} diverges from every start: {', '.join(starts)}.")
-    best = _best(*ends.values())
+    best = _best(*ends)
     commands, (low, high) = cost.commands(best.point, exogenous.shape[1]), bounds(plant.actions)
     flown = Rollout(plant, closure)(initial_state, exogenous, commands)
     excess, slope = ((commands - flown.actions) / (high - low)).abs().max().item(), torch.from_numpy(best.slope)
-    return Clairvoyant(control_cost(plant, flown), flown, slope, excess, costs, first, best.evaluations)
+    return Clairvoyant(control_cost(plant, flown), flown, slope, excess, costs, best.evaluations)
 
 
 def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import math
 import statistics
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -28,14 +27,11 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Inputs
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 RECORDS = 20
 """Number of episodes, with other draws, whose inputs a forecast is fitted to."""
 RECORDS_SEED = 0
-CALLS = 50
-"""Number of actions that are timed."""
 REST = 0.2
 """Longest part of an episode, as a share of it, in which a start may rest at its end."""
 
@@ -71,13 +67,11 @@ class Contender:
     Args:
         costs: J_a of each episode.
         merit: mean of each of the plant's own quantities.
-        milliseconds: wall-clock time of an action [ms], as ``median`` and ``max``; None for the clairvoyant optimum.
         details: further results.
     """
 
     costs: list[float]
     merit: dict[str, float]
-    milliseconds: dict[str, float] | None
     details: dict[str, Any]
 
     @property
@@ -86,13 +80,11 @@ class Contender:
         return statistics.fmean(self.costs)
 
 
-def judged(
-    episodes: UnseenEpisodes, flown: Trajectory, milliseconds: dict[str, float] | None, **details: Any
-) -> Contender:
+def judged(episodes: UnseenEpisodes, flown: Trajectory, **details: Any) -> Contender:
     """The contender that has flown the episodes."""
-    found = episodes.judge(flown)
-    costs = found.control_costs.tolist()
-    return Contender(costs=costs, merit=found.means(), milliseconds=milliseconds, details=details)
+    costs, merit = episodes.judge(flown)
+    means = {name: values.mean().item() for name, values in merit.items()}
+    return Contender(costs=costs.tolist(), merit=means, details=details)
 
 
 def limit(
@@ -105,17 +97,16 @@ def limit(
         "projected_gradient": found.gradient.max().item(),
         "excess": found.excess,
         "above_the_best": found.spread(),
-        "above_the_best_at_first": found.spread(first=True),
         "gradients": found.gradients,
     }
-    return judged(episodes, found.flown, None, **evidence)
+    return judged(episodes, found.flown, **evidence)
 
 
 def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Actions]:
     """The commands of the controllers, some of which rest at the end."""
     starts = {}
     for name, kind in config.starts.items():
-        flown = episodes.fly_baseline(kind(episodes.physics)).actions
+        flown = episodes.fly(kind(episodes.physics)).actions
         if name in config.resting:
             starts[f"{name}, resting"] = resting_at_the_end(episodes, flown)
         else:
@@ -150,23 +141,6 @@ def resting_at_the_end(episodes: UnseenEpisodes, commands: Actions) -> Actions:
     return torch.stack([tried[k][episode] for episode, k in enumerate(costs.argmin(0).tolist())])
 
 
-def classical(episodes: UnseenEpisodes, kind: type[ClassicalController]) -> Contender:
-    """A classical controller with its default gains."""
-    controller = kind(episodes.physics)
-    flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1, : len(episodes.plant.readings)]
-    memory, exogenous = controller.first_memory(state), episodes.exogenous[:1, 0]
-    return judged(episodes, flown, timed(lambda: controller.law(state, memory, exogenous)))
-
-
-def learned(episodes: UnseenEpisodes, policy: nn.Module) -> Contender:
-    """A trained policy; what is timed is an action of one observation."""
-    plant, flown = episodes.plant, episodes.fly(policy)
-    if isinstance(policy, StateFeedback):
-        return judged(episodes, flown, None)
-    seen = torch.zeros(1, dtype=torch.float64), episodes.initial_state[:1], episodes.exogenous[:1, 0]
-    return judged(episodes, flown, timed(lambda: policy(plant.observe(*seen))))
-
-
 def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
     """The window, or one that is as long as the plant's episodes where these are shorter.
 
@@ -191,9 +165,11 @@ def receding(
     controller = RecedingHorizon(model, closure, config, forecast=forecast)
     flown = controller.fly(episodes.initial_state, episodes.exogenous, exact, plant=episodes.plant)
     batch, solves = len(episodes.initial_state), controller.solves
-    milliseconds = in_milliseconds([solve.seconds for solve in solves[batch:]])  # the first solves trace the programs
+    seconds = [solve.seconds for solve in solves[batch:]]  # the first solves trace the programs
+    milliseconds = {"median": 1e3 * statistics.median(seconds), "max": 1e3 * max(seconds)}
     gradients = statistics.median(solve.gradients for solve in solves)
-    return judged(episodes, flown, milliseconds, gradients=gradients, late=sum(solve.late for solve in solves))
+    late = sum(solve.late for solve in solves)
+    return judged(episodes, flown, milliseconds=milliseconds, gradients=gradients, late=late)
 
 
 def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
@@ -210,22 +186,6 @@ def forecasts(plant: Plant, exogenous: Inputs, window: PredictiveConfig) -> dict
     decaying = Decaying.fitted(records, **over)
     scattered = Scattered.fitted(decaying, records, **over, pairs=FUTURES)
     return {"held": Held(), "decaying": decaying, "scattered": scattered, "preview": Foreseen(exogenous, dt=plant.dt)}
-
-
-@torch.no_grad()
-def timed(action: Callable[[], object]) -> dict[str, float]:
-    """Median and greatest wall-clock time of some calls of an action [ms]."""
-    seconds = []
-    for _ in range(CALLS):
-        began = time.perf_counter()
-        action()
-        seconds.append(time.perf_counter() - began)
-    return in_milliseconds(seconds)
-
-
-def in_milliseconds(seconds: list[float]) -> dict[str, float]:
-    """Median and greatest of some times [ms]."""
-    return {"median": 1e3 * statistics.median(seconds), "max": 1e3 * max(seconds)}
 
 
 @torch.no_grad()

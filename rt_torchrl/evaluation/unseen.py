@@ -52,20 +52,6 @@ Baseline = ClassicalController | RealController
 """A controller that is judged beside the policies: on the plant, or on a real system of which no closure is known."""
 
 
-def require_classical(law: Baseline, plant: Plant) -> ClassicalController:
-    """Refuse a controller that can only be flown on the real system.
-
-    Raises:
-        ValueError: if it is one.
-    """
-    if not isinstance(law, ClassicalController):
-        raise ValueError(
-            f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
-            f"{plant.name!r}."
-        )
-    return law
-
-
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
@@ -120,7 +106,19 @@ class UnseenEpisodes:
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
-        """Fly the episodes with a policy on the real system."""
+        """Fly the episodes with a policy or a classical controller.
+
+        Raises:
+            ValueError: if the controller can only be flown on the real system.
+        """
+        if isinstance(policy, RealController):
+            raise ValueError(
+                f"law={type(policy).__name__} can only be flown on a real system; give a ClassicalController of plant "
+                f"{self.plant.name!r}."
+            )
+        return self._flown(policy)
+
+    def _flown(self, policy: nn.Module) -> Trajectory:
         if isinstance(policy, StateFeedback):
             return policy.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
         return self.rollout(policy)(self.initial_state, self.exogenous)
@@ -142,15 +140,6 @@ class UnseenEpisodes:
             )
         return self.closure
 
-    def fly_baseline(self, law: Baseline) -> Trajectory:
-        """Fly the episodes with a classical controller on the real system as it is now.
-
-        Raises:
-            ValueError: if the controller can only be flown on the real system.
-        """
-        law = require_classical(law, self.plant)
-        return law.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
-
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Costs:
         """J_a of each episode."""
@@ -159,10 +148,12 @@ class UnseenEpisodes:
         return self.rollout(policy).costs(self.initial_state, self.exogenous)
 
     def validation(self) -> "UnseenEpisodes | None":
-        """Validation episodes: as many, with other draws, on the system as it is now; None if they would cost flights.
+        """Validation episodes: as many, with other draws, on the system as it is now; None if nobody knows its closure.
 
         A policy that is chosen by its cost on some episodes costs less on these than on others.
         """
+        if self.closure is None:
+            return None
         count, device = self.initial_state.shape[0], self.initial_state.device
         found = UnseenEpisodes(self.plant, count, compiled=self._compiled, device=device, seed=VALIDATION_SEED)
         found.closure = self.closure
@@ -230,9 +221,8 @@ class TwinEpisodes(UnseenEpisodes):
         """The plant of the believed twin, which has more states than the real system's where a hypothesis adds some."""
         return self._twin.believed.plant
 
-    @torch.no_grad()
-    def fly(self, policy: nn.Module) -> Trajectory:
-        """Fly the episodes with a policy on the twin; one in which the twin diverges is NaN from its first interval."""
+    def _flown(self, policy: nn.Module) -> Trajectory:
+        """The flights on the twin; one in which the twin diverges is NaN from its first interval."""
 
         def flown(start: Tensor, exogenous: Tensor) -> Trajectory:
             try:
@@ -246,17 +236,6 @@ class TwinEpisodes(UnseenEpisodes):
                 return Trajectory(torch.cat([start[:, None], lost], 1), actions, exogenous)
 
         return flown(self.flying.at_rest(self.initial_state), self.exogenous)
-
-    def fly_baseline(self, law: Baseline) -> Trajectory:
-        """Fly the episodes with a classical controller on the twin.
-
-        Raises:
-            ValueError: if the controller can only be flown on the real system.
-        """
-        return self.fly(require_classical(law, self.plant))
-
-    def validation(self) -> None:
-        """No validation episodes, because the referee has compared the policies on the twin already."""
 
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
         """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""
@@ -285,6 +264,8 @@ class RealEpisodes(UnseenEpisodes):
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly as many episodes on the real system, whose training episodes then go on as if it had not."""
+        if isinstance(policy, RealController):
+            return policy.fly_real(self._count, seed=UNSEEN_SEED)
         kept = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
@@ -292,15 +273,6 @@ class RealEpisodes(UnseenEpisodes):
         finally:
             self._system.load_state_dict(kept)
         return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
-
-    def validation(self) -> None:
-        """No validation episodes, because a real episode may take hours."""
-
-    def fly_baseline(self, law: Baseline) -> Trajectory:
-        """Fly as many episodes on the real system with a controller."""
-        if isinstance(law, RealController):
-            return law.fly_real(self._count, seed=UNSEEN_SEED)
-        return self.fly(law)
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""
@@ -323,20 +295,12 @@ class RealEpisodes(UnseenEpisodes):
         live.begin(policy, strength=0.0)
         return TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
-    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
-        """No categories, because the exogenous inputs need not be the same each time."""
-        return {}
-
 
 class Judged(NamedTuple):
     """J_a and the plant's own quantities of each unseen episode under one controller."""
 
     control_costs: Costs
     merit: dict[str, Costs]
-
-    def means(self) -> dict[str, float]:
-        """Mean of each of the plant's own quantities."""
-        return {name: values.mean().item() for name, values in self.merit.items()}
 
     def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
         """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median.

@@ -17,7 +17,7 @@ are then cut into segments with first states of their own (multiple shooting), w
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import AtLeastOne, Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
@@ -60,16 +61,17 @@ MOST_UNKNOWNS = 1000
 """Greatest number of first states of segments; the normal equations hold its square."""
 
 
-@runtime_checkable
-class Fitted(Protocol):
-    """Result of one descent."""
+class Minimum(NamedTuple):
+    """A likelihood at its minimum, its cost, the number of trial steps, and the length of its segments."""
 
-    @property
-    def best(self) -> float:
-        """The least cost."""
+    likelihood: Likelihood
+    best: float
+    iterations: int
+    segment: int = 0
 
 
-F = TypeVar("F", bound=Fitted)
+F = TypeVar("F", bound=Descended | Minimum)
+R = TypeVar("R")
 
 
 def multi_start(
@@ -111,7 +113,9 @@ def multi_start(
     return results
 
 
-R = TypeVar("R")
+def best_of(tried: Sequence[Minimum]) -> Minimum:
+    """The least minimum, with the trial steps of all."""
+    return min(tried, key=lambda minimum: minimum.best)._replace(iterations=sum(one.iterations for one in tried))
 
 
 def over_segments(
@@ -253,15 +257,6 @@ class Estimate(NamedTuple):
         return warnings + self.uncertainty.warnings()
 
 
-class _Minimum(NamedTuple):
-    """A likelihood at its minimum, its cost, the number of trial steps, and the length of its segments."""
-
-    likelihood: Likelihood
-    best: float
-    iterations: int
-    segment: int = 0
-
-
 class Estimation:
     """Estimates a twin's closure from what sensors read.
 
@@ -323,14 +318,14 @@ class Estimation:
             minimum.segment,
         )
 
-    def _minimum(self, records: Sequence[SensorRecord], length: int) -> _Minimum:
+    def _minimum(self, records: Sequence[SensorRecord], length: int) -> Minimum:
         """Fit records, or segments of a length, from the present weights, with the noise levels that they leave."""
         closure, config = self.twin.closure, self.config
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
         prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior)
-        tried = multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number))
-        minimum, iterations = min(tried, key=lambda minimum: minimum.best), sum(minimum.iterations for minimum in tried)
+        minimum = best_of(multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number)))
+        iterations = minimum.iterations
         for _ in range(config.rounds):
             rest = self._follow_residuals(minimum.likelihood)
             iterations += self._descended(minimum.likelihood).iterations
@@ -338,14 +333,14 @@ class Estimation:
                 break
         return minimum._replace(iterations=iterations, segment=length)
 
-    def _longest(self, records: Sequence[SensorRecord]) -> _Minimum:
+    def _longest(self, records: Sequence[SensorRecord]) -> Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         scatter = scatter_of(self.sensors, records)
         given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
         lengths, done = [len(record.actions) for record in records], 0
         free, samples = int((self.spread > 0.0).sum()), sum(int(record.seen.sum()) for record in records)
 
-        def fit(length: int) -> tuple[_Minimum, Tensor]:
+        def fit(length: int) -> tuple[Minimum, Tensor]:
             nonlocal done
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
@@ -411,34 +406,25 @@ class Estimation:
         method.run(likelihood.normal_equations, INITIAL_ITERATIONS)
         return likelihood
 
-    def _both_ways(self, records: Sequence[SensorRecord], prior: WeightPrior, number: int) -> _Minimum:
+    def _both_ways(self, records: Sequence[SensorRecord], prior: WeightPrior, number: int) -> Minimum:
         """The minimum under the first noise levels by the better way; weights moved at random go the second one."""
         closure = self.twin.closure
-        start = copy.deepcopy(closure.state_dict())
-        if number:
-            return self._staged(records, prior)
-        together = self._descended(self.likelihood(records, prior=prior))
-        weights_together = copy.deepcopy(closure.state_dict())
-        closure.load_state_dict(start)
-        try:
-            staged = self._staged(records, prior)
-        except FloatingPointError:
-            staged = together._replace(iterations=0)
-        done = together.iterations + staged.iterations
-        if staged.best < together.best:
-            return staged._replace(iterations=done)
-        closure.load_state_dict(weights_together)
-        return together._replace(iterations=done)
 
-    def _staged(self, records: Sequence[SensorRecord], prior: WeightPrior) -> _Minimum:
-        done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations
-        minimum = self._descended(self.likelihood(records, prior=prior))
-        return minimum._replace(iterations=done + minimum.iterations)
+        def descend(staged: int) -> Minimum:
+            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if staged else 0
+            minimum = self._descended(self.likelihood(records, prior=prior))
+            return minimum._replace(iterations=done + minimum.iterations)
 
-    def _descended(self, likelihood: Likelihood) -> _Minimum:
+        return (
+            descend(1)
+            if number
+            else best_of(multi_start(closure, 2, descend, first=copy.deepcopy(closure.state_dict())))
+        )
+
+    def _descended(self, likelihood: Likelihood) -> Minimum:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
         descended = optimiser.run(likelihood.normal_equations, self.config.iterations)
-        return _Minimum(likelihood, descended.best, descended.iterations)
+        return Minimum(likelihood, descended.best, descended.iterations)
 
     def _follow_residuals(self, likelihood: Likelihood) -> bool:
         """Set noise levels and prior by the residuals; whether they rest."""

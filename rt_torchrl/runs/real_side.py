@@ -234,7 +234,7 @@ def contenders(
     known = config.start != "random" or isinstance(policy, StateFeedback)
     if known or not clones(policy, untrained[live]):
         found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
-    return found | {name: Contender(name, partial(asked.fly_baseline, law)) for name, law in baselines.items()}
+    return found | {name: Contender(name, partial(asked.fly, law)) for name, law in baselines.items()}
 
 
 def announcement(found: Mapping[str, Contender], count: int) -> str:

@@ -70,7 +70,7 @@ def flights_of(
     flights: dict[str, Trajectory] = dict(of_each_role(policies, unseen.fly).items())
     for name, law in baselines.items():
         try:
-            flights[name] = unseen.fly_baseline(law)
+            flights[name] = unseen.fly(law)
         except DivergenceError as error:  # a controller to compare with must not take the results of a training
             warnings.warn(f"baseline {name!r} is left out of the results: {error}", stacklevel=2)
     return flights
@@ -289,9 +289,8 @@ def beside_the_limit(episodes: UnseenEpisodes, known: LimitConfig, costs: dict[s
 
 
 def entry(contender: Contender) -> dict[str, Any]:
-    """The plant's own quantities, times and details of a contender."""
-    times = {} if contender.milliseconds is None else {"milliseconds": contender.milliseconds}
-    return {"merit": contender.merit, **times, **contender.details}
+    """The plant's own quantities and the details of a contender."""
+    return {"merit": contender.merit, **contender.details}
 
 
 SCREEN = 24
