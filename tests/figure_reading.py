@@ -68,3 +68,8 @@ def collisions(figure) -> list[tuple[str, str]]:
 def line(ax, label):
     """The line with this label."""
     return next(line for line in ax.lines if line.get_label() == label)
+
+
+def panel(figure, caption):
+    """The axes whose caption begins so."""
+    return next(ax for ax in figure.axes if ax.get_title(loc="left").startswith(caption))

@@ -1,19 +1,22 @@
-"""Animations of turbine and tank against the numbers they are drawn from, and their shared parts."""
+"""Figures of every plant within their canvas, and animations against the numbers they are drawn from."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from figure_reading import snapshot_of
+from figure_reading import clipped_texts, collisions, draw, snapshot_of
 from PIL import Image
 
 from rt_torchrl.envs.cryogenic_tank import figures as tank
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing import figures as drone
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import figures as turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures.animation import RATE, shown_samples
+from rt_torchrl.figures.animation import FRAMES, RATE, shown_samples
 
 
 @pytest.fixture(scope="module")
@@ -24,17 +27,47 @@ def blowing():
 
 @pytest.fixture(scope="module")
 def boiling():
-    return snapshot_of(CryogenicTank(horizon=600.0), ConstantCoefficients.true(), shift=1.0)
+    episodes = [{"closure": {"U_s": 46.0, "U_HX": 70.0, "K_JT": 480e9}}] * 2
+    return snapshot_of(CryogenicTank(horizon=600.0), ConstantCoefficients.true(), shift=1.0, episodes=episodes)
 
 
-@pytest.mark.parametrize(("scene", "snapshot"), [(turbine, "blowing"), (tank, "boiling")])
-def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
+@pytest.fixture(scope="module")
+def flying():
+    return snapshot_of(FlappingWing(horizon=0.2), QuasiSteadyPolar.true(), shift=0.1, realisations=False)
+
+
+@pytest.mark.parametrize(
+    ("figures", "snapshot", "names"),
+    [
+        (turbine, "blowing", {"power_and_speed", "power_coefficient", "scatter"}),
+        (tank, "boiling", {"tank", "heat_exchanger", "closure_weights"}),
+        (drone, "flying", {"flight_path", "flight", "polars", "control_surfaces"}),
+    ],
+)
+def test_every_figure_of_a_plant_is_drawn_within_its_canvas(figures, snapshot, names, request):
+    drawn = figures.figures_of(request.getfixturevalue(snapshot))
+    assert set(drawn) == names
+    for name, figure in drawn.items():
+        assert draw(figure)
+        assert clipped_texts(figure) == [] and not collisions(figure), name
+
+
+@pytest.mark.parametrize(
+    ("scene", "snapshot", "frames"),
+    [
+        (turbine, "blowing", 20),
+        (tank, "boiling", 20),
+        pytest.param(drone, "flying", FRAMES, marks=pytest.mark.slow),
+    ],
+)
+def test_it_has_a_frame_for_each_interval_up_to_the_greatest_number(scene, snapshot, frames, tmp_path, request):
     path = scene.scene(request.getfixturevalue(snapshot)).save(tmp_path / "last.gif")
     with Image.open(path) as animation:
-        assert animation.n_frames == 20 and animation.info["duration"] == 1000 / RATE
+        assert animation.n_frames == frames and animation.info["duration"] == 1000 / RATE
         first = np.asarray(animation.convert("RGB"))
-        animation.seek(19)
+        animation.seek(frames - 1)
         assert (np.asarray(animation.convert("RGB")) != first).any()
+    assert path.stat().st_size < 3_000_000
 
 
 def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import clipped_texts, collisions, draw, line, snapshot_of
+from figure_reading import draw, line, panel, snapshot_of
 
 from rt_torchrl import figures as general
 from rt_torchrl.envs.cryogenic_tank import figures
@@ -24,18 +24,6 @@ def snapshot() -> Snapshot:
     twin = ConstantCoefficients(torch.tensor([found[-1] for found in FOUND.values()], dtype=torch.float64))
     episodes = [{"closure": {name: found[k] for name, found in FOUND.items()}} for k in range(2)]
     return snapshot_of(CryogenicTank(horizon=6 * 3600.0), twin, shift=10.0, episodes=episodes)
-
-
-def panel(figure, caption):
-    return next(ax for ax in figure.axes if ax.get_title(loc="left").startswith(caption))
-
-
-def test_every_figure_is_drawn_within_its_canvas(snapshot):
-    drawn = figures.figures_of(snapshot)
-    assert set(drawn) == {"tank", "heat_exchanger", "closure_weights"}
-    for name, figure in drawn.items():
-        assert draw(figure)
-        assert clipped_texts(figure) == [] and not collisions(figure), name
 
 
 def test_tank_is_the_record(snapshot):
@@ -145,12 +133,3 @@ def test_closure_weights_are_left_out_of_older_records(snapshot):
     assert np.isnan(found[0]) and list(found[1:]) == FOUND["U_s"]
     untrained = replace(snapshot, large_scale=None, realisations=None)
     assert "closure_weights" not in general.figures_of(untrained) | figures.figures_of(untrained)
-
-
-def test_policy_curves_are_on_both_sides_of_the_set_point(snapshot):
-    (ax,) = general.policy_contours(snapshot).axes
-    for role in ("model_based", "model_free"):
-        curve = line(ax, role.replace("_", "-"))
-        error = torch.from_numpy(curve.get_xdata())[:, None]
-        np.testing.assert_allclose(curve.get_ydata(), snapshot.policies[role](error)[:, 0].detach(), rtol=1e-12)
-        assert error.min() < 0.0 < error.max()

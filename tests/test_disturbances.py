@@ -2,7 +2,6 @@
 
 import math
 import struct
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -211,29 +210,6 @@ def test_faulty_bts_files_are_refused(tmp_path, spoil, message):
     path.write_bytes(spoil(bts_bytes(plane()[1])[0]))
     with pytest.raises(ValueError, match=rf"field\.bts: {message}"):
         read_wind(path)
-
-
-def peak_memory(read):
-    """Greatest memory that Python and NumPy allocate meanwhile [bytes]; mapped files do not count."""
-    tracemalloc.start()
-    try:
-        read()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-# n_z, n_y, n_tower, n_t and the length of the description, all as great as they can be declared.
-@pytest.mark.parametrize("offset", [2, 6, 10, 14, 66])
-def test_a_giant_size_is_refused_without_memory_for_it(tmp_path, offset):
-    path = tmp_path / "field.bts"
-    path.write_bytes(patched(bts_bytes(plane()[1])[0], offset, "<i", 2**31 - 1))
-
-    def read():
-        with pytest.raises(ValueError, match=r"field\.bts: is truncated, it holds 6679 bytes"):
-            read_wind(path)
-
-    assert peak_memory(read) < 1e6
 
 
 def test_wind_has_the_mean_and_covariance_of_the_process():

@@ -76,10 +76,6 @@ def test_every_figure_is_drawn_within_its_canvas(name, request):
     snapshot = request.getfixturevalue(name)
     drawn = figures.figures_of(snapshot)
     assert set(drawn) == EVERYWHERE | {"exogenous"}
-    if name == "turbine":
-        more = turbine_figures.figures_of(snapshot)
-        assert set(more) == {"power_and_speed", "power_coefficient", "scatter"}
-        drawn |= more
     for figure in drawn.values():
         assert draw(figure)
         assert clipped_texts(figure) == [] and not collisions(figure)

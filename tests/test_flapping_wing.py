@@ -9,7 +9,6 @@ from scipy.integrate import trapezoid
 from scipy.optimize import fsolve
 from seeds_and_numbers import double, seeded
 
-from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.trajectories.rollout import Rollout
@@ -171,13 +170,6 @@ def test_six_elements_are_as_good_as_forty(duration):
 
 
 # Closure and policy
-
-
-def test_polar_is_the_papers():
-    alpha = torch.linspace(0.0, math.pi, 50, dtype=torch.float64)
-    C_L, C_D = QuasiSteadyPolar.true()(torch.stack([alpha.sin(), alpha.cos()], -1)).unbind(-1)
-    torch.testing.assert_close(C_L, 1.71 * torch.sin(2 * alpha))
-    torch.testing.assert_close(C_D, 0.043 + 1.595 * (1 - torch.cos(2 * alpha)))
 
 
 def test_first_guess_of_the_polar_is_within_half_of_the_truth(plant):

@@ -6,15 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import clipped_texts, collisions, draw, line, snapshot_of
-from PIL import Image
+from figure_reading import draw, line, panel, snapshot_of
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.figures import scene
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.figures.animation import FRAMES, RATE
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -28,20 +25,8 @@ def snapshot() -> Snapshot:
     return snapshot_of(FlappingWing(horizon=0.2), twin, shift=0.1, realisations=False)
 
 
-def panel(figure, caption):
-    return next(ax for ax in figure.axes if ax.get_title(loc="left") == caption)
-
-
 def same(line, values) -> bool:
     return np.array_equal(line.get_ydata(), values.numpy())
-
-
-def test_every_figure_is_drawn_within_its_canvas(snapshot):
-    drawn = figures.figures_of(snapshot)
-    assert set(drawn) == {"flight_path", "flight", "polars", "control_surfaces"}
-    for name, figure in drawn.items():
-        assert draw(figure)
-        assert clipped_texts(figure) == [] and not collisions(figure), name
 
 
 def test_collectors_path_is_the_record(snapshot):
@@ -159,21 +144,3 @@ def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapsho
         # The corner is a vertex of the band that holds its value.
         distance = np.linalg.norm(filled.get_paths()[level].vertices - corner, axis=1)
         assert distance.min() < 1e-9
-
-
-@pytest.mark.slow
-def test_animation_has_all_frames(snapshot, tmp_path):
-    path = scene(snapshot).save(tmp_path / "flight.gif")
-    with Image.open(path) as animation:
-        assert animation.n_frames == FRAMES
-        assert animation.info["duration"] == 1000 / RATE
-        first = np.asarray(animation.convert("RGB"))
-        animation.seek(FRAMES - 1)
-        assert (np.asarray(animation.convert("RGB")) != first).any()
-    assert path.stat().st_size < 3_000_000
-
-
-def test_animation_of_another_format_is_refused(snapshot, tmp_path):
-    with pytest.raises(ValueError, match=r"flight\.mp4.*must end in '\.gif'"):
-        scene(snapshot).save(tmp_path / "flight.mp4")
-    assert list(tmp_path.iterdir()) == []

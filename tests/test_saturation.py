@@ -13,17 +13,7 @@ from rt_torchrl.envs.cryogenic_tank import saturation
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 
 LOW, HIGH = 80e3, 900e3
-KEYS = {"T": ("T", 0), "rho_l": ("D", 0), "rho_v": ("D", 1), "h_l": ("H", 0), "h_v": ("H", 1)}
-
-
-def pressures(n=301):
-    """Pressures that are not nodes of the fit, except for the two ends."""
-    return np.linspace(LOW, HIGH, n)
-
-
-def from_coolprop(fluid, p):
-    """Properties by CoolProp's high-level interface; the fit uses the low-level one."""
-    return np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS.values()])
+KEYS = (("T", 0), ("D", 0), ("D", 1), ("H", 0), ("H", 1))
 
 
 def slopes_of_coolprop(fluid, p):
@@ -51,19 +41,16 @@ def own_cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("fluid", ["Hydrogen", "ParaHydrogen", "Nitrogen"])
-def test_values_are_those_of_coolprop(fluid):
-    p = pressures()
-    values = np.stack([x.numpy() for x in Saturation(fluid)(torch.from_numpy(p))])
-    truth = from_coolprop(fluid, p)
+def test_values_and_slopes_are_those_of_coolprop(fluid):
+    p = np.linspace(LOW, HIGH, 301)  # no nodes of the fit, except for the two ends
+    values, slopes = (
+        np.stack([x.numpy() for x in part]) for part in Saturation(fluid).with_slopes(torch.from_numpy(p))
+    )
+    # CoolProp's high-level interface; the fit uses the low-level one.
+    truth = np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS])
     assert (np.abs(values - truth).max(1) < 1e-6 * np.abs(truth).max(1)).all()
-
-
-@pytest.mark.parametrize("fluid", ["Hydrogen", "ParaHydrogen", "Nitrogen"])
-def test_slopes_are_those_of_coolprop(fluid):
-    p = pressures()[1:-1]
-    _, slopes = Saturation(fluid).with_slopes(torch.from_numpy(p))
-    found, truth = np.stack([x.numpy() for x in slopes]), slopes_of_coolprop(fluid, p)
-    assert (np.abs(found - truth).max(1) < 1e-4 * np.abs(truth).max(1)).all()
+    truth, slopes = slopes_of_coolprop(fluid, p[1:-1]), slopes[:, 1:-1]
+    assert (np.abs(slopes - truth).max(1) < 1e-4 * np.abs(truth).max(1)).all()
 
 
 def test_derivatives_of_values_and_slopes():
@@ -146,18 +133,13 @@ def test_modules_do_not_share_their_buffers(own_cache):
 
 
 def damaged(path, how):
-    content = path.read_bytes()
-    if how == "truncated":
-        path.write_bytes(content[: len(content) // 2])
-    elif how == "empty":
-        path.write_bytes(b"")
-    elif how == "flipped":
-        middle = len(content) // 2
-        path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    content, middle = path.read_bytes(), path.stat().st_size // 2
+    if how in ("empty", "flipped"):
+        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+        path.write_bytes(flipped if how == "flipped" else b"")
     else:
         table = np.load(path)["table"]
-        table = {"nan": table * math.nan, "shape": table[:-1], "single": table.astype(np.float32)}.get(how, table)
-        np.savez(path, table=table)
+        np.savez(path, table=table * math.nan if how == "nan" else table[:-1])
 
 
 @pytest.mark.parametrize("how", ["empty", "flipped", "nan", "shape"])
