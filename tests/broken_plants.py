@@ -9,6 +9,7 @@ from traced_function import Bounded, Recurrent, Rows
 
 from rt_torchrl import Signal
 from rt_torchrl.plants.plant import Transition
+from rt_torchrl.plants.policies import mlp
 
 PLACE, SPEED = LinearQuadratic.states
 FORCE = LinearQuadratic.actions[0]
@@ -111,6 +112,10 @@ for message, overrides in (
         {"make_neural_closure": lambda self, generator, hidden: Bounded(Recurrent(outputs=2))},
     ),
     (
+        "(make_neural_closure|vector_field): raised RuntimeError .*shapes cannot be multiplied",
+        {"make_neural_closure": lambda self, generator, hidden: mlp(7, hidden, 1, generator=generator)},
+    ),
+    (
         r"running_cost: cost has shape \(1,\) for t \(\), .*expected .*shape \(\)",
         changed("running_cost", lambda cost: cost.unsqueeze(-1)),
     ),
@@ -205,6 +210,11 @@ def field_without_weights(self, t, state, action, exogenous, closure):
     with torch.no_grad():
         unknown = closure(state)
     return inherited("vector_field")(self, t, state, action, exogenous, lambda features: 0.0 * features) + unknown
+
+
+@breaks("merit: raised RuntimeError .*not from n_steps")
+def merit(self, states, applied, exogenous):
+    return {"work [J]": (torch.zeros(self.n_steps, dtype=states.dtype) + applied[..., 0]).mean(-1)}
 
 
 @breaks("step: plant 'linear_quadratic' diverged in realisation", "running_cost", A=((5000.0, 1.0), (-1.0, 0.0)))

@@ -124,17 +124,6 @@ def test_the_terminal_cost_is_a_part_of_every_cost(tank):
         torch.testing.assert_close(costs, expected, rtol=1e-11, atol=0.0)
 
 
-def test_gradients_of_the_terminal_cost_by_policy_and_initial_state(tank):
-    state, load = tank.draw_initial_state(3, seeded()), tank.draw_exogenous(3, seeded())
-    policy, found = tank.make_policy(seeded(1)), {}
-    for engine in ("native", "autograd"):
-        first = state.clone().requires_grad_()
-        cost = Rollout(tank, tank.closure, policy, engine=engine).costs(first, load).sum()
-        found[engine] = torch.autograd.grad(cost, [first, *policy.parameters()])
-    for native, exact in zip(*found.values(), strict=True):
-        torch.testing.assert_close(native, exact, rtol=1e-9, atol=1e-9 * exact.abs().max().item())
-
-
 def test_rewards_sum_to_the_cost_by_steps_and_by_machine_code(tank):
     env, policy = PlantEnv(tank, seed=3), tank.make_policy(seeded(1))
     with torch.no_grad():
@@ -150,15 +139,3 @@ def test_rewards_sum_to_the_cost_by_steps_and_by_machine_code(tank):
     states = torch.cat([episode["state"], episode["next", "state"][:, -1:]], 1)
     found = control_cost(tank, type(flown)(states, episode["next", "applied"], episode["exogenous"]))
     torch.testing.assert_close(-episode["next", "reward"][..., 0].mean(-1), found, rtol=1e-9, atol=0.0)
-
-
-def test_an_optimal_vent_goes_on_until_the_end_where_the_end_has_a_price():
-    """Of constant openings in the last hours, the cheapest is shut where nobody pays for the end, else open."""
-    ends = []
-    for weight in (0.0, 43_200.0):
-        plant = CryogenicTank(horizon=21_600.0, cost=PressureCost(end=weight))
-        state = plant.state_at(double(510e3)).expand(3, 3)
-        load = torch.full((3, plant.n_steps, 1), 130.0, dtype=torch.float64)
-        share = double(0.0, 0.5, 1.0).view(3, 1, 1).expand(3, plant.n_steps, 1)
-        ends.append(Rollout(plant, plant.closure).costs(state, load, 200e3 * share).argmin().item())
-    assert ends == [0, 2]

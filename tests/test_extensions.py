@@ -175,26 +175,6 @@ def test_the_inflow_of_a_constant_force_rises_exponentially():
     torch.testing.assert_close(hidden, 1.0 + (0.1 - 1.0) * torch.exp(-t / 0.5), rtol=1e-12, atol=1e-12)
 
 
-class Bounded(LinearQuadratic):
-    """Ends half a metre from its set point, which it shows."""
-
-    end_cost = 100.0
-
-    def ended(self, state):
-        return state[..., 0].abs() > 0.5
-
-    def setpoints(self, states, applied, exogenous):
-        return {"x": (states[..., 0], torch.zeros_like(states[..., 0]))}
-
-
-def test_an_episode_ends_and_is_shown_by_the_true_state_and_not_by_the_reading():
-    plant = BiasedSensor(Bounded(), "position", 1.0, scale=1.0)
-    reads = torch.tensor([[1.2, 0.0, 1.0], [0.2, 0.0, 1.0]]).double()  # the true positions are 0.2 and -0.8
-    assert plant.ended(reads).tolist() == [False, True]
-    value, _ = plant.setpoints(reads, torch.zeros(2, 1).double(), torch.zeros(2, 1).double())["x"]
-    assert value.tolist() == pytest.approx([0.2, -0.8])
-
-
 def test_a_biased_sensor_changes_what_is_read_and_not_what_happens():
     plant, base = EXTENSIONS["bias"](LinearQuadratic()), LinearQuadratic()
     state, exogenous, command = flight(plant)

@@ -390,13 +390,6 @@ def test_a_prior_pulls_to_the_closure_that_a_training_begins_with_and_goes_on_do
             torch.testing.assert_close(weight, torch.full_like(weight, 0.3), rtol=0, atol=1e-4)
 
 
-def test_a_segment_longer_than_the_record_is_refused():
-    twin, flown, exogenous = recorded(LinearQuadratic(horizon=2.0), batch=1)
-    record = flown.each()[0]
-    with pytest.raises(ValueError, match="segment=21 of the assimilation exceeds the 20 control"):
-        Assimilation(twin, AssimilationConfig(segment=21, inputs="record")).update([record], [], 1, seeded())
-
-
 def test_the_error_where_visited_is_that_of_the_coefficients():
     """On the turbine, where the features are known: λ = ωR/u and the pitch."""
     plant = PLANTS[0]

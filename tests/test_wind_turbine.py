@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded
 from torch import nn
 
-from rt_torchrl import StackedObservations
+from rt_torchrl import StackedObservations, check_plant
 from rt_torchrl.envs.wind_turbine import plant as module
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
@@ -25,7 +25,6 @@ from rt_torchrl.evaluation.unseen import RealEpisodes
 from rt_torchrl.plants.policies import SmoothClip
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import control_cost
 
 R, RHO, N_G, J = 63.0, 1.225, 97.0, 38_759_228.0 + 534.116 * 97**2
 OMEGA_RATED = 1.26711
@@ -330,26 +329,12 @@ def test_with_jonkmans_constants_it_flies_as_his_controller():
     torch.testing.assert_close(power, expected, rtol=0.015, atol=0.0)
 
 
-def test_the_exact_gradient_of_the_gains_is_that_of_finite_differences():
-    plant = WindTurbine(horizon=60.0, observe=("scheduled",))
-    state, wind = plant.draw_initial_state(2, seeded(2)), plant.draw_exogenous(2, seeded(2)) + 2.0
-    policy = GainScheduled(plant, generator=seeded(4))
-    rollout = Rollout(plant, plant.closure, policy)
+def test_the_gains_have_the_gradients_of_finite_differences():
+    class Scheduled(WindTurbine):
+        def make_policy(self, generator):
+            return GainScheduled(self, generator=generator)
 
-    def cost():
-        return control_cost(plant, rollout(state, wind)).mean()
-
-    (gradient,) = torch.autograd.grad(cost(), policy.weights)
-    for k in range(len(gradient)):
-        values = []
-        for step in (1e-5, -1e-5):
-            with torch.no_grad():
-                policy.weights[k] += step
-                values.append(cost().item())
-                policy.weights[k] -= step
-        # Central differences of a cost of order 0.1: rounding 1e-11, truncation below it but for kinks of the limits.
-        assert gradient[k].item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-4, abs=1e-8)
-    assert gradient.abs().min() > 0.0
+    check_plant(Scheduled(horizon=60.0, observe=("scheduled",)), episodes=2, steps=20, traced=False)
 
 
 # ROSCO's simulator of the same turbine: against our plant, as a real system, and under ROSCO's own controller.

@@ -40,7 +40,9 @@ class KaimalWind:
         S(f) = \frac{4\sigma^2 L/U}{(1 + 6fL/U)^{5/3}},\quad f_k = k\,\Delta f,\; \Delta f = \frac1{n\,\Delta t}
 
     with :math:`\sigma = I U` and phases uniform on [0, 2π). The frequencies are multiples of 1/T up to the Nyquist
-    frequency, so the record is periodic with its length T = n·dt, as TurbSim's is, and its mean is exactly U.
+    frequency, so the record is periodic with its length T = n·dt, as TurbSim's is, and its mean is exactly U. Every
+    sample is scaled, before the floor, to have the standard deviation σ (divisor n), as by TurbSim's ``ScaleIEC``: the
+    band of a record of 600 s at 0.5 s holds (0.935 σ)², and the spectrum of the sample exceeds S by 14 %.
 
     Args:
         mean: mean speed U [m/s], positive.
@@ -49,9 +51,6 @@ class KaimalWind:
         floor: least wind speed [m/s], to which slower wind is raised; by default the turbine's cut-in, below which it
             does not run. ``-math.inf`` means no floor. At 11 m/s and 16 % the default lies 4.5 σ below the mean, and
             the wind hardly ever reaches it.
-        scale_to_target: whether every sample is scaled, before the floor, to have the standard deviation σ (divisor n),
-            as by TurbSim's ``ScaleIEC``. An unscaled sample holds only the variance inside its band, (0.935 σ)² for
-            600 s at 0.5 s; the spectrum of a scaled sample exceeds S by the reciprocal, here by 14 %.
 
     Raises:
         ValueError: if an argument is out of its range.
@@ -63,7 +62,6 @@ class KaimalWind:
     intensity: float = 0.16
     length_scale: float = 340.2
     floor: float = CUT_IN_WIND
-    scale_to_target: bool = True
 
     def __post_init__(self) -> None:
         require_range("mean", self.mean, 1e-3, STORM, unit="m/s", of="KaimalWind")
@@ -110,8 +108,7 @@ class KaimalWind:
             # carry a quarter of its power.
             coefficients[:, -1] = 2.0 * coefficients[:, -1].real
         fluctuation = torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
-        if self.scale_to_target:
-            fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
+        fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
         return (self.mean + self.sigma * fluctuation).clamp_min(self.floor)
 
 
