@@ -37,13 +37,13 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.steps.assimilate import Assimilate, Assimilation
+from rt_torchrl.steps.assimilate import Assimilate
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
-from rt_torchrl.steps.interact import Clearance, Interact, Operating, RealFlights, ShortTermMemory
+from rt_torchrl.steps.interact import Clearance, Interact, RealFlights
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, episode_report, findings, merged, on_device
@@ -92,23 +92,12 @@ class ReinforcementTwinning(TensorDictSequential):
 
     module: nn.ModuleDict
     env: EnvBase | Operation
-    twin: DigitalTwin
-    config: TwinningConfig
-    generator: torch.Generator
-    first: Start | None
-    policies: dict[Role, nn.Module]
+    actor: LivePolicy
+    collector: Operation | BaseCollector
     learner: Learner
     planner: Planner
     referee: Referee
-    virtual: VirtualEpisodes
-    belief: Belief
-    flights: RealFlights
-    actor: LivePolicy
-    collector: Operation | BaseCollector
-    assimilation: Assimilation
-    short_term: ShortTermMemory
-    operating: Operating | None
-    steps: dict[str, Any]
+    first: Start | None
 
     def __init__(
         self,
@@ -155,7 +144,7 @@ class ReinforcementTwinning(TensorDictSequential):
         assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
         planning, imitation = MultiStart(planner, belief, config.planner, make_policy), Imitation(belief, judged)
         count = config.planner.realisations or config.realisations
-        steps: dict[str, TensorDictModuleBase] = {
+        steps: dict[str, Any] = {
             "interact": interact,
             "learn": Learn(learner, belief, judged),
             "inputs": FitInputs(virtual),
@@ -165,28 +154,13 @@ class ReinforcementTwinning(TensorDictSequential):
         }
         super().__init__(OrderedDict((name, steps[name]) for name in ARMS[config.arm]))
         self.closure, self.model_free, self.model_based = twin.closure, model_free, model_based
-        # These are no sub-modules: what lasts of them belongs to the steps.
-        self.__dict__.update(
-            env=env,
-            twin=twin,
-            config=config,
-            generator=generator,
-            first=first,
-            policies=policies,
-            learner=learner,
-            planner=planner,
-            referee=referee,
-            virtual=virtual,
-            belief=belief,
-            flights=flights,
-            actor=actor,
-            collector=collector,
-            assimilation=assimilation,
-            short_term=interact.short_term,
-            operating=interact.operating,
-            steps=steps,
-        )
+        self.twin, self.config, self.generator, self.policies = twin, config, generator, policies
+        self.virtual, self.belief, self.assimilation, self.flights = virtual, belief, assimilation, flights
+        self.short_term, self.operating, self.steps = interact.short_term, interact.operating, steps
         self.episodes_done = 0
+        # These may be modules, but no sub-modules: what lasts of them belongs to the steps.
+        parts = {"env": env, "actor": actor, "collector": collector, "first": first}
+        self.__dict__.update(parts, learner=learner, planner=planner, referee=referee)
 
     def insert(self, name: str, step: TensorDictModuleBase, *, before: str) -> None:
         """Insert a step of one's own.
@@ -248,11 +222,11 @@ class ReinforcementTwinning(TensorDictSequential):
             half.restart()
         if not pupils:
             return episode
-        self.flights.begin()
+        self.flights.faults = []
         flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         for flight in flights:
-            self.steps["learn"].store(flight.parts(self.twin.plant.dt))
+            self.steps["learn"].store(flight.parts)
             self.short_term.append(flight.record)
             if on_twin:
                 self.virtual.learn(flight.record)
@@ -289,7 +263,10 @@ class ReinforcementTwinning(TensorDictSequential):
                     return merged(taken, findings(*reasons, closure_refused=1.0)) if reasons else taken
                 except DivergenceError as error:
                     if not closures:
-                        return self._left_out(episode, policy, reasons, str(error))
+                        self.model_based.load_state_dict(policy)
+                        left_out = findings(*reasons, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
+                        warning = f"the twin diverges under a policy that has flown: {error}"
+                        return merged(episode, left_out.set_non_tensor("warning", warning))
                     reasons = reasons or [f"closure refused: {error}"]
                 self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
                 self.twin.closure.load_state_dict(closures.pop(0))
@@ -300,15 +277,6 @@ class ReinforcementTwinning(TensorDictSequential):
         except BaseException:
             self.model_based.load_state_dict(policy)
             raise
-
-    def _left_out(
-        self, episode: TensorDictBase, policy: dict[str, Any], reasons: list[str], error: str
-    ) -> TensorDictBase:
-        """The episode without a step in which the twin diverges with every closure."""
-        self.model_based.load_state_dict(policy)
-        report = findings(*reasons, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
-        report.set_non_tensor("warning", f"the twin diverges under a policy that has flown: {error}")
-        return merged(episode, report)
 
     def select_subsequence(
         self, in_keys: Iterable[NestedKey] | None = None, out_keys: Iterable[NestedKey] | None = None

@@ -15,7 +15,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
-from rt_torchrl.steps.interact import ShortTermMemory
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -28,7 +27,10 @@ IDLE = dataclasses.replace(LEARNING, critic_iterations=0, actor_iterations=0)
 """A learner without iterations, whose tracing takes longer than all else in a short episode."""
 
 
-def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
+def twinning(
+    plant=None, *, seed=0, env_seed=0, env=None, closure=None, model_free=None, model_based=None, first=None, **options
+):
+    """The algorithm on a real system, by default in simulation; ``options`` are those of its configuration."""
     plant = plant or LinearQuadratic(horizon=2.0)
     generator = torch.Generator().manual_seed(seed)
     config = TwinningConfig(
@@ -42,12 +44,13 @@ def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
         }
     )
     return ReinforcementTwinning(
-        PlantEnv(plant, seed=env_seed),
+        env or PlantEnv(plant, seed=env_seed),
         DigitalTwin(plant, closure or plant.make_closure(generator)),
-        model_free=plant.make_policy(generator),
-        model_based=plant.make_policy(generator),
+        model_free=model_free or plant.make_policy(generator),
+        model_based=model_based or plant.make_policy(generator),
         config=config,
         generator=generator,
+        first=first,
     )
 
 
@@ -254,19 +257,6 @@ def test_planning_finds_the_optimal_gain():
     assert np.linalg.norm(gain - best) < 1e-3 * np.linalg.norm(best), (gain, best)
 
 
-def test_costs_of_both_policies_are_from_the_same_draws():
-    """Equal policies cost the same, whatever was drawn; and the draws differ from call to call."""
-    found = twinning(virtual_episodes=4, records=2)
-    for _ in range(2):
-        flown(found, "interact", "inputs")
-    found.policies["model_based"].load_state_dict(found.policies["model_free"].state_dict())
-    first, second = ({}, {})
-    for costs in (first, second):
-        episodes = found.virtual.draw(4)
-        costs |= {role: found.belief.judge(policy, episodes) for role, policy in found.policies.items()}
-    assert first["model_free"] == first["model_based"] and first["model_free"] != second["model_free"]
-
-
 def test_a_step_of_ones_own_flows_with_the_others():
     """The twin is the real system, so that the residual of the page is rounding."""
     plant = LinearQuadratic(horizon=2.0)
@@ -292,12 +282,3 @@ def test_keys_flow_as_the_steps_declare():
     assert record["states"].shape == (n + 1, 2) and record["actions"].shape == record["exogenous"].shape == (n, 1)
     assert len(episode["transitions", "0"]) == n and episode["large_scale"].shape == (n, 1)
     assert set(found.in_keys) == {"number", "live"}
-
-
-def test_short_term_memory_keeps_the_last_episodes_in_order():
-    memory = ShortTermMemory(2)
-    for record in "abc":
-        memory.append(record)
-    assert list(memory) == ["b", "c"]
-    with pytest.raises(ValueError, match="capacity=0"):
-        ShortTermMemory(0)

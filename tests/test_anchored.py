@@ -163,10 +163,10 @@ def virtual_episodes(physics, count=20):
 def test_a_twin_that_has_been_right_keeps_the_word():
     physics = LinearQuadratic()
     belief = belief_of(physics, physics, [(0.5, 0.5), (0.6, 0.5)])
-    assert belief.correction(LinearGain([[2.0, 2.0]])).item() == 0.0 and not belief.contradicted
+    assert belief.correction(LinearGain([[2.0, 2.0]])).item() == 0.0 and belief.anchors() is None
     dear = belief.flown[0]._replace(cost=1.1 * belief.flown[0].cost)
     belief.append(dear.trajectory, "model_based", dear.cost, weights=dear.weights)
-    assert belief.contradicted and belief.correction(LinearGain([[0.5, 0.5]])).item() > 0.03
+    assert belief.anchors() and belief.correction(LinearGain([[0.5, 0.5]])).item() > 0.03
     assert belief.expected(LinearGain([[0.5, 0.5]]), -4.0) == -4.0
     assert belief.expected(LinearGain([[0.5, 0.5]]), math.inf) == math.inf
 
@@ -174,7 +174,7 @@ def test_a_twin_that_has_been_right_keeps_the_word():
 def test_corrections_are_averaged_and_those_of_like_policies_count_once():
     real, physics = pushed()
     belief, policy = belief_of(real, physics, [(0.5, 0.5), (1.5, 0.4), (1.5, 0.4)]), LinearGain([[1.0, 0.5]])
-    anchors = belief._anchors()
+    anchors = belief.anchors()
     points = torch.cat([anchors.replays.actions(policy)[None], anchors.replays.flown]).detach().numpy()
     c = anchors.replays.corrections(policy).detach().numpy()
     apart = ((points[:, None] - points[None]) ** 2).sum(-1)
@@ -194,7 +194,7 @@ def test_a_policy_that_flew_costs_what_it_did_and_a_distant_one_has_its_risk():
     assert belief.judge(LinearGain([[2.0, 0.5]]), episode).expected == pytest.approx(cost.item(), rel=2.0 * NOISE**2)
     risks = []
     for gain in (2.0, 2.5, 4.0):
-        policy, anchors = LinearGain([[gain, 0.5]]), belief._anchors()
+        policy, anchors = LinearGain([[gain, 0.5]]), belief.anchors()
         risks.append(belief.correction(policy).item() - anchors.replays.corrections(policy).item())
     assert risks[0] == pytest.approx(0.5 * NOISE**2) and risks[0] < risks[1] < risks[2]
 
@@ -255,7 +255,7 @@ def test_scatter_between_episodes_is_no_distance_of_policies():
     real, physics = pushed()
     gains = [(gain, 0.5) for gain in (0.5, 0.52, 0.54, 0.56, 0.58, 0.6)]
     belief, episodes = belief_of(real, physics, gains), virtual_episodes(real, 200)
-    assert belief._anchors().noise > 0.1 and belief._anchors().growth < 1000.0
+    assert belief.anchors().noise > 0.1 and belief.anchors().growth < 1000.0
     seen = Scenario(episodes.initial_state[:, :2], episodes.exogenous)
     for gain in (0.55, 0.7, 1.0):
         policy = LinearGain([[gain, 0.5]])
@@ -272,7 +272,7 @@ def test_an_episode_that_flew_costs_what_it_did_whatever_hypotheses_weigh(share)
     belief = belief_of(real, physics, [(0.5, 0.5)], twin=twin)
     policy = LinearGain([[0.5, 0.5]])
     (record,), inputs, cost = flown_on(real, policy, physics, count=1)
-    replays = belief._anchors().replays
+    replays = belief.anchors().replays
     assert replays.corrections(policy).item() == pytest.approx(belief.differences()[0], rel=1e-9)
     said = twin.cost(policy, record.states[:1], inputs).item()
     assert said * replays.corrections(policy).exp().item() == pytest.approx(cost.item(), rel=1e-9)
@@ -282,7 +282,7 @@ def test_of_weights_that_flew_their_own_flights_count_and_not_those_of_their_nei
     """Two episodes of one policy, which an unread force makes dearer by different factors."""
     real, physics = pushed()
     belief = belief_of(real, physics, [(0.5, 0.5), (0.5, 0.5), (0.501, 0.5), (0.502, 0.5)])
-    noise, (first, second, *_) = belief._anchors().noise, belief.differences()
+    noise, (first, second, *_) = belief.anchors().noise, belief.differences()
     assert abs(first - second) > 0.1
     assert belief.expected(LinearGain([[0.5, 0.5]]), 2.0) == pytest.approx(
         2.0 * math.exp(0.5 * (first + second) + 0.25 * noise)
@@ -302,7 +302,7 @@ def test_an_episode_on_which_the_twin_diverges_is_left_out():
     before = belief.correction(LinearGain([[0.55, 0.5]])).item()
     wild = belief.flown[0]._replace(weights={"gain": torch.tensor([[-1e3, 0.0]]).double()})
     belief.append(wild.trajectory, "model_based", wild.cost, weights=wild.weights)
-    assert abs(belief.differences()[-1]) == 5.0 and len(belief._anchors().replays.read) == 2
+    assert abs(belief.differences()[-1]) == 5.0 and len(belief.anchors().replays.read) == 2
     assert belief.correction(LinearGain([[0.55, 0.5]])).item() == pytest.approx(before, rel=1e-9)
 
 
@@ -350,7 +350,7 @@ def test_an_episode_that_explored_says_less():
     real, physics = pushed()
     beliefs = [belief_of(real, physics, [(0.5, 0.5)], noise=noise) for noise in (0.0, 0.5)]
     risks = [
-        belief.correction(policy).item() - belief._anchors().replays.corrections(policy).item()
+        belief.correction(policy).item() - belief.anchors().replays.corrections(policy).item()
         for belief in beliefs
         for policy in [LinearGain([[0.5, 0.5]])]
     ]
@@ -362,14 +362,14 @@ def test_the_latest_whole_episodes_are_replayed_and_again_where_the_twin_has_cha
     belief = belief_of(real, physics, [(0.5 + 0.01 * k, 0.5) for k in range(ANCHORS + 2)])
     part = belief.flown[-1].trajectory.part(0, 10, physics.dt)
     belief.append(part, "model_based", 1.0)
-    anchors, policy = belief._anchors(), LinearGain([[0.52, 0.5]])
-    assert len(anchors.replays.read) == ANCHORS + 2 and belief._anchors() is anchors
+    anchors, policy = belief.anchors(), LinearGain([[0.52, 0.5]])
+    assert len(anchors.replays.read) == ANCHORS + 2 and belief.anchors() is anchors
     few = anchors.replays.latest(ANCHORS)
     assert torch.equal(few.corrections(policy), anchors.replays.corrections(policy)[2:])
     assert belief.correction(policy, latest=ANCHORS) != belief.correction(policy)
     with torch.no_grad():
         belief.virtual.twin.closure.matrix[0, 0] += 1e-3
-    assert belief._anchors() is not anchors
+    assert belief.anchors() is not anchors
 
 
 def test_plans_on_expected_costs_find_what_the_twin_alone_does_not():

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import random
 
 import pytest
 import torch
@@ -135,31 +134,20 @@ def test_without_a_belief_costs_may_be_negative(options):
 @pytest.mark.parametrize(
     ("differences", "wrong"),
     [
-        ((), False),
-        ((0.05, -0.05, 0.1), False),
-        ((0.2,), False),
-        ((0.31,), True),
-        ((0.16, 0.16), True),
-        ((-0.16, -0.2), True),
-        ((0.16, -0.16), False),
-        ((1.0, 1.0, 0.1), False),
+        ((), None),
+        ((0.05, -0.05, 0.1), None),
+        ((0.2,), None),
+        ((0.31,), "the last episode cost 1.36 times as much"),
+        ((0.16, 0.16), "the last 2 episodes cost 1.17 times as much as the twin says of them"),
+        ((-0.16, -0.2), "cost 1/1.2 of what the twin says"),
+        ((0.16, -0.16), None),
+        ((0.0, 0.0, 1.0), "the last episode cost 2.72 times as much as the twin says of it"),
+        ((1.0, 1.0, 0.1), None),
     ],
 )
-def test_the_alarm(differences, wrong):
-    assert (alarm(differences) is not None) == wrong
-
-
-def test_the_alarm_says_how_wrong_the_twin_is():
-    assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
-    assert "cost 1/2.01 of what the twin says" in alarm((-0.69, -0.71))
-    assert "the last episode cost 2.72 times as much as the twin says of it" in alarm((0.0, 0.0, 1.0))
-
-
-def test_false_alarms_of_a_sound_twin_are_rare():
-    draws, alarms = random.Random(1), 0
-    for _ in range(2000):
-        alarms += alarm([draws.gauss(0.0, 0.05) for _ in range(5)]) is not None
-    assert alarms / 2000 < 0.01
+def test_the_alarm_says_how_wrong_the_twin_is(differences, wrong):
+    said = alarm(differences)
+    assert said is None if wrong is None else wrong in said
 
 
 def report_costs(found, factor):
@@ -361,11 +349,6 @@ def test_roles_exchange_and_only_by_a_swap(live, other):
     assert (referee.live, referee.idle) == (other, live)
     referee = play(RefereeConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
     assert (referee.live, referee.idle) == (live, other)
-
-
-@pytest.mark.parametrize("live_cost, event", [(0.99, "keep"), (1.0, "keep"), (1.01, "swap")])
-def test_the_live_policy_is_worse_where_it_costs_more(live_cost, event):
-    assert DecisionTree(RefereeConfig(patience=0)).decide(evidence(live_cost, 1.0, MOVING)) == event
 
 
 @pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "idle_weight_change"])))

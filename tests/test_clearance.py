@@ -9,7 +9,6 @@ from small_runs import SMALL
 from test_algorithm import flown as after
 from test_algorithm import twinning
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.options import read_options
 from rt_torchrl.runs.real_side import simulated
@@ -28,16 +27,9 @@ LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force
 def limited(limits=LIMITS, **options):
     plant = LinearQuadratic(horizon=2.0)
     options = {"referee": RefereeConfig(rule="decision_tree")} | options  # which keeps every update
-    parts = twinning(plant, limits=OperatingLimitsConfig(), **options)
     config = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
     layer = SafetyLayer(PlantEnv(plant, seed=0), config, fallback=(0.0,))
-    return ReinforcementTwinning(
-        layer,
-        parts.twin,
-        config=dataclasses.replace(parts.config, limits=limits),
-        generator=torch.Generator().manual_seed(0),
-        **parts.policies,
-    )
+    return twinning(plant, env=layer, limits=limits, **options)
 
 
 def test_what_leaves_a_limit_is_found_by_hand():

@@ -7,15 +7,13 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
 from test_algorithm import LEARNING, STEPS, flown, twinning, weights
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig
-from rt_torchrl.steps.imitation import Imitation, match_actions
+from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import same_architecture
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -73,7 +71,7 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
     with torch.no_grad():
         live.network[-1].weight.mul_(20.0)
     points = torch.randn(400, 2, generator=seeded(8), dtype=torch.float64)
-    error = match_actions(PLANT, live(points).detach(), idle, points, 200)
+    error = imitation()._match(idle, [(points, live(points).detach())])
     low, high = bounds(PLANT.actions)
 
     def loss():
@@ -91,15 +89,9 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
 
 
 def two_architectures(**options):
-    found = twinning(PLANT, learner=LEARNING, referee=RefereeConfig(clone_patience=0, stall=1e9), **options)
-    return ReinforcementTwinning(
-        PlantEnv(PLANT, seed=0),
-        DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)),
-        model_free=perceptron(),
-        model_based=affine([-0.8, -1.1]),
-        config=found.config,
-        generator=seeded(9),
-    )
+    options = {"learner": LEARNING, "referee": RefereeConfig(clone_patience=0, stall=1e9), **options}
+    policies = {"model_free": perceptron(), "model_based": affine([-0.8, -1.1])}
+    return twinning(PLANT, seed=9, closure=LinearClosure(PLANT.true_closure), **policies, **options)
 
 
 @pytest.mark.parametrize("live", ["model_free", "model_based"])

@@ -187,7 +187,7 @@ def test_windows_count_what_an_end_costs(monkeypatch):
     end = plant.end_cost / plan.reference
     costs[1, 3:] = end
     found = plan._targets(costs, seen, over)
-    torch.testing.assert_close(found[0], plan._targets(costs[:1], seen[:1])[0])
+    torch.testing.assert_close(found[0], plan._targets(costs[:1], seen[:1], over[:1])[0])
     v = plan.target(seen[1]).squeeze(-1)
     last = 0.1 * costs[1, 2] + 0.9 * end  # of the interval that ends it: what follows is known
     torch.testing.assert_close(found[1, 2:], torch.stack([last, *[torch.tensor(end).double()] * 2]).detach())

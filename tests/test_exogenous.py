@@ -56,19 +56,6 @@ def test_covariance_is_that_of_the_residual():
     torch.testing.assert_close(found.covariance[:6, 0, 0], 4.0 * 0.5**lags, rtol=0, atol=0.4)
 
 
-@pytest.mark.parametrize("n", [8, 1201])
-def test_spectrum_of_the_embedding_is_not_negative(n):
-    """The embedding is a covariance: its eigenvalues, the FFT of the circulant, are not negative but for rounding."""
-    found = process(autoregressive(n, 0.9, seed=n))
-    C = found.covariance[:, 0, 0].numpy()
-    circulant = np.concatenate([C, [0.0], C[:0:-1]])
-    assert len(circulant) == 2 * n
-    eigenvalues = np.fft.fft(circulant)
-    assert np.abs(eigenvalues.imag).max() < 1e-12 * eigenvalues.real.max()
-    assert eigenvalues.real.min() > -1e-12 * eigenvalues.real.max()
-    assert C[0] > 0 and (np.abs(C) <= C[0]).all()
-
-
 def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     n, period = 1200, 300.0
     t = DT * np.arange(n)

@@ -4,39 +4,25 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
+from test_algorithm import twinning
 from test_classical import PD, episodes
 
-from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig
 from rt_torchrl.steps.start import FirstController
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 GAINS = (0.4, 0.3)
 
 
-def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
-    plant = LinearQuadratic(horizon=2.0)
-    generator = torch.Generator().manual_seed(3)
+def begun(*, gains=GAINS, **options):
+    """The algorithm that begins with a controller of these gains."""
+    first = FirstController(PD(LinearQuadratic(horizon=2.0), gains))
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
-    descent = DescentConfig(optimiser="lbfgs", rate=1.0)
-    planner = PlannerConfig(iterations=iterations, descent=descent)
-    assimilation = AssimilationConfig(iterations=3)
-    parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
-    return ReinforcementTwinning(
-        PlantEnv(plant, seed=0),
-        DigitalTwin(plant, plant.make_closure(generator)),
-        model_free=model_free or plant.make_policy(generator),
-        model_based=plant.make_policy(generator),
-        config=TwinningConfig(realisations=4, virtual_episodes=4, **parts, **options),
-        generator=generator,
-        first=FirstController(PD(plant, gains)),
-    )
+    parts = {"planner": PlannerConfig(iterations=0), "assimilation": AssimilationConfig(iterations=3)}
+    counts = {"realisations": 4, "virtual_episodes": 4}
+    return twinning(seed=3, first=first, learner=learner, **counts, **parts, **options)
 
 
 def test_it_acts_as_it_flies():
@@ -53,7 +39,7 @@ def test_it_acts_as_it_flies():
 
 
 def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
-    found = twinning()
+    found = begun()
     closure = found.twin.closure.matrix.detach().clone()
     report = found.start()
     for policy in found.policies.values():
@@ -72,24 +58,9 @@ def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
     assert report["start_cost"].item() == pytest.approx(cost.item(), rel=0.3) and report["start_cost"] > 0.0
 
 
-def test_only_the_first_episode_begins_with_it():
-    found = twinning()
-    first, second = found.episode(), found.episode()
-    assert "start_cost" in first and "start" in first["seconds"]
-    assert "start_cost" not in second and first["live"] == "model_based"
-    assert first["real_cost"].item() != first["start_cost"].item()
-
-
-def test_both_architectures_imitate():
-    plant = LinearQuadratic(horizon=2.0)
-    other = SaturatedMLP(2, plant.actions, hidden=(8,), generator=torch.Generator().manual_seed(0))
-    report = twinning(model_free=other).start()
-    assert 0.0 < report["start_error_model_free"] < 0.05 and report["start_error_model_based"] < 1e-3
-
-
 @pytest.mark.parametrize("arm", ["model_free", "model_based"])
 def test_each_half_alone_begins_with_it(arm):
-    found = twinning(arm=arm)
+    found = begun(arm=arm)
     closure = found.twin.closure.matrix.detach().clone()
     found.episode()
     assert torch.equal(closure, found.twin.closure.matrix) == (arm == "model_free")
@@ -97,7 +68,7 @@ def test_each_half_alone_begins_with_it(arm):
 
 
 def test_a_harmful_controller_is_not_imitated():
-    found = twinning(gains=(1e-6, 30.0))
+    found = begun(gains=(1e-6, 30.0))
     before = found.policies["model_based"].gain.detach().clone()
     assert "does not imitate the controller" in found.start()["reason"]
     assert torch.equal(before, found.policies["model_based"].gain)

@@ -507,17 +507,6 @@ def test_importance_weights_undo_the_sampling(monkeypatch):
     torch.testing.assert_close(batch["priority_weight"].double(), expected, rtol=1e-5, atol=0)
 
 
-def test_refreshed_errors_change_the_sampling(monkeypatch):
-    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", 1e-6)
-    found = memory(prioritisation=1.0)
-    found.store(labelled([0.0, 1.0, 2.0]), torch.tensor([1.0, 0.0, 0.0]))
-    assert (found.sample(200)["label"] == 0.0).all()
-    batch = TensorDict({"index": torch.tensor([0, 2])}, batch_size=[2])
-    found.refresh(batch["index"], torch.tensor([0.0, -3.0]))
-    # The others have a share of 2e-6/3 each.
-    assert (found.sample(200)["label"] == 2.0).all()
-
-
 def test_eviction_goes_by_the_present_priorities():
     """Errors rank one way at first and the other way after a refresh; the transitions that are now least go first."""
     found = memory(capacity=6)

@@ -11,7 +11,7 @@ from seeds_and_numbers import seeded
 from small_runs import SMALL, small_run
 from test_algorithm import twinning, weights
 from test_belief import EPISODES, REFUTED, Content, belief_of, gains, said
-from test_first_controller import twinning as begun
+from test_first_controller import begun
 
 from rt_torchrl import RefereeConfig
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -440,8 +440,9 @@ def constants(monkeypatch):
 def test_targets_are_discounted_sums(constants):
     constants(mixing=0.7, discount=0.9)
     plan = planner(LinearQuadratic())
+    plan.reference = 1.0
     costs, seen = (torch.rand(3, n, *width, generator=seeded(n)).double() for n, width in ((5, ()), (6, (2,))))
-    values = plan.target(seen)[..., 0].detach()
+    values, never = plan.target(seen)[..., 0].detach(), torch.zeros(3, 6, dtype=torch.bool)
     for b in range(3):
         for k in range(5):
             # By the definition: sums of every length m, weighted by (1 − λ)λ^(m−1), the longest by the rest.
@@ -450,7 +451,7 @@ def test_targets_are_discounted_sums(constants):
                 total = sum(0.1 * 0.9**j * costs[b, k + j] for j in range(m)) + 0.9**m * values[b, k + m]
                 share = weight * 0.3 if m < 5 - k else weight
                 expected, weight = expected + share * total, weight * 0.7
-            found = plan._targets(costs, seen)[b, k]
+            found = plan._targets(costs, seen, never)[b, k]
             torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)  # rounding
 
 

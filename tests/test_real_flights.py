@@ -13,7 +13,6 @@ from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.loaded_run import load_run
@@ -63,6 +62,17 @@ def run_on(
     return Run(config, plant, env=connected(plant, rig=machine, closure=closure), **given)
 
 
+def costs_by_hand(plant, closure, episodes, act):
+    """J_a of episodes that are flown in a loop of our own."""
+    s, costs = plant.at_rest(episodes.initial_state), 0.0
+    for k in range(STEPS):
+        t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
+        command = act(t, s, z)
+        costs = costs + plant.running_cost(t, s, plant.actuate(s, command), z) / STEPS
+        s = plant.step(t, s, command, z, closure).state
+    return costs + plant.terminal_cost(s) / (STEPS * plant.dt)
+
+
 def machine():
     return Machine(LinearQuadratic(horizon=2.0))
 
@@ -90,13 +100,7 @@ def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
     assert unseen["J_p"]["mean"] is None and unseen["J_p_before"]["mean"] is None
     # The same flights in a loop of our own, under the law that the twin has found.
     twin, policy, plant = run.algorithm.twin, run.algorithm.policies["model_based"], rig.inner.plant
-    s, costs = run.unseen.initial_state, 0.0
-    for k in range(STEPS):
-        t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
-        a = plant.actuate(s, policy(plant.observe(t, s, z)))
-        costs = costs + plant.running_cost(t, s, a, z) / STEPS
-        s = plant.step(t, s, a, z, twin.closure).state
-    costs = costs + plant.terminal_cost(s) / (STEPS * plant.dt)
+    costs = costs_by_hand(plant, twin.closure, run.unseen, lambda t, s, z: policy(plant.observe(t, s, z)))
     assert unseen["costs"]["model_based"] == pytest.approx(costs.tolist(), rel=1e-9)
     # What nobody knows is not simulated as if it were the guess of the data sheet.
     finished = load_run(tmp_path, plant=plant)
@@ -153,15 +157,14 @@ def test_a_classical_controller_is_judged_on_the_episodes_of_the_policies_where_
     run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, baselines={"mine": Tracking}, figures=True)
     summary = run.train()["summary"]
     plant, twin = rig.inner.plant, run.algorithm.twin.believed
-    s, costs, law = run.unseen.initial_state, 0.0, Tracking(plant)
-    memory = law.first_memory(s)
-    for k in range(STEPS):
-        t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
-        command, memory = law.respond(s, memory, z)
-        a = plant.actuate(s, command)
-        costs = costs + plant.running_cost(t, s, a, z) / STEPS
-        s = plant.step(t, s, a, z, twin.closure).state
-    costs = costs + plant.terminal_cost(s) / (STEPS * plant.dt)
+    law = Tracking(plant)
+    memory = [law.first_memory(run.unseen.initial_state)]
+
+    def act(t, s, z):
+        command, memory[0] = law.respond(s, memory[0], z)
+        return command
+
+    costs = costs_by_hand(plant, twin.closure, run.unseen, act)
     unseen = summary["unseen"]
     assert [*unseen["baselines"]] == ["mine", "PD"] and unseen["judged_on"] == "twin"
     assert unseen["baselines"]["mine"]["J_a"]["mean"] == pytest.approx(costs.mean().item(), rel=1e-9)
@@ -234,12 +237,8 @@ def test_flights_are_those_of_the_hypothesis_that_is_believed():
     policy, episodes = LinearGain([[0.5, 0.5]]), TwinEpisodes(twin, plant, 3)
     for weights, physics in ({"as the twin": 1.0}, plant), ({"lag": 1.0}, lagged):
         twin.weights = weights
-        s, expected = physics.at_rest(episodes.initial_state), 0.0
-        for k in range(STEPS):
-            t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
-            command = policy(physics.observe(t, s, z))
-            expected = expected + physics.running_cost(t, s, physics.actuate(s, command), z) / STEPS
-            s = physics.step(t, s, command, z, physics.closure).state
+        act = lambda t, s, z: policy(physics.observe(t, s, z))  # noqa: B023, E731
+        expected = costs_by_hand(physics, physics.closure, episodes, act)
         torch.testing.assert_close(episodes.control_costs(policy), expected.detach(), rtol=1e-9, atol=0.0)
 
 
@@ -247,13 +246,6 @@ def test_flights_are_those_of_the_hypothesis_that_is_believed():
 
 
 HORIZON = 2.0
-
-
-def algorithm(env):
-    """The algorithm on this real system."""
-    parts = twinning(LinearQuadratic(horizon=HORIZON))
-    generator = torch.Generator().manual_seed(0)
-    return ReinforcementTwinning(env, parts.twin, config=parts.config, generator=generator, **parts.policies)
 
 
 class Judged(Rig):
@@ -274,21 +266,12 @@ class Judged(Rig):
         return super()._step(tensordict)
 
 
-def test_a_machine_is_reset_once_an_episode_at_its_beginning():
-    plant = LinearQuadratic(horizon=HORIZON)
-    machine = Judged(plant)
-    found = algorithm(connected(plant, rig=machine))
-    assert machine.done == []
-    for _ in range(3):
-        found.episode()
-    assert machine.done == ["reset", *["step"] * 20] * 3
-
-
 def test_after_a_failure_the_next_episode_begins_with_a_reset():
     plant = LinearQuadratic(horizon=HORIZON)
     machine = Judged(plant)
-    found = algorithm(connected(plant, rig=machine))
+    found = twinning(env=connected(plant, rig=machine))
     found.episode()
+    assert machine.done == ["reset", *["step"] * 20]
     machine.fails_at = 7  # too little of the episode is sound then
     for _ in range(2):
         with pytest.raises(ValueError, match="3 real episodes in a row .*in interval 7, at 0.7 s: Connection"):
@@ -305,7 +288,7 @@ def test_episodes_of_a_simulation_are_every_second_draw_of_its_seed(guarded):
     """As in version 0.1, whose figures rest on them."""
     plant = LinearQuadratic(horizon=HORIZON)
     env = PlantEnv(plant, seed=4)
-    found = algorithm(SafetyLayer(env, SafetyConfig(interval=0.1), fallback=(0.0,)) if guarded else env)
+    found = twinning(env=SafetyLayer(env, SafetyConfig(interval=0.1), fallback=(0.0,)) if guarded else env)
     generator = torch.Generator().manual_seed(4)
     for _ in range(3):
         flown(found)
@@ -327,11 +310,11 @@ class Ends(PlantEnv):
 def test_an_environment_that_terminates_is_refused_with_what_to_do():
     plant = LinearQuadratic(horizon=HORIZON)
     message = "terminated the episode after 7 of 20 control intervals .* at most 0.7 s"
-    found = algorithm(Ends(plant))
+    found = twinning(env=Ends(plant))
     with pytest.raises(ValueError, match=message):
         found.episode()
     assert not len(found.learner.memory) and not found.short_term
-    found = algorithm(connected(plant, rig=Rig(plant, ends_after=7, terminates=True)))
+    found = twinning(env=connected(plant, rig=Rig(plant, ends_after=7, terminates=True)))
     with pytest.raises(ValueError, match=message):
         found.episode()
 
@@ -342,7 +325,7 @@ def test_a_layer_that_loses_patience_is_refused_with_what_to_do():
     config = SafetyConfig(interval=0.1, patience=0.0)
     layer = SafetyLayer(Blind(plant), config, fallback=(0.0,))
     with pytest.raises(ValueError, match="truncated the episode after 4 of 20 control intervals"):
-        algorithm(layer).episode()
+        twinning(env=layer).episode()
 
 
 class Blind(PlantEnv):

@@ -55,7 +55,7 @@ class Snapshot:
         record, twin = algorithm.short_term[-1], algorithm.twin
         n, flight = len(record.actions), algorithm.flights.latest
         # An episode of which only a part is sound has no process; that of one that ended early goes on to the horizon.
-        whole = algorithm.short_term.whole(twin.plant.n_steps, latest=1) or (flight is not None and flight.ended)
+        whole = n == twin.plant.n_steps or (flight is not None and flight.ended)
         fitted = algorithm.virtual.processes and whole
         process = algorithm.virtual.processes[-1] if fitted else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)

@@ -105,8 +105,8 @@ def judged_on(
         unseen.judged_on = "simulation" if env is None else "simulation of the real system"
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
-    physics = twin.plant
-    unseen.physics, unseen.bounds = physics, StateBounds(plant.readings, config.twinning.bounded_states)
+    bounds = {**config.twinning.limits.states, **config.twinning.planner.constraints.states}
+    unseen.physics, unseen.bounds = twin.plant, StateBounds(plant.readings, bounds)
     return unseen
 
 

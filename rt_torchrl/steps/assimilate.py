@@ -36,6 +36,7 @@ from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import differences
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
@@ -180,18 +181,20 @@ class Assimilation:
         return Descended(math.inf, math.inf, math.inf, self.config.iterations)
 
     def _descend(self, replayed: Trajectory) -> Descended:
-        before, config = self.prior.cost().item(), self.config
+        config = self.config
+        prior = self.prior.cost if self.prior.stiffness else lambda: torch.zeros((), dtype=torch.float64)
+        before = prior().item()
         if config.method == "levenberg_marquardt":
             found = self._least_squares(replayed)
         else:
             found = self.descent.run(
-                lambda: self._identification_cost(replayed) + self.prior.cost(),
+                lambda: self._identification_cost(replayed) + prior(),
                 config.iterations,
                 stop_below=config.stop_below,
             )
         if math.isinf(found.start):
             raise FloatingPointError("J_p of finite states overflows")
-        return found._replace(start=found.start - before, best=found.best - self.prior.cost().item())
+        return found._replace(start=found.start - before, best=found.best - prior().item())
 
     def _least_squares(self, replayed: Trajectory) -> Descended:
         """Descend by Levenberg-Marquardt from each of the first weights; the best weights stay."""
@@ -211,9 +214,11 @@ class Assimilation:
         return found[0]._replace(best=min((one.best for one in found), default=math.nan))
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
-        states, actions, exogenous, start, seen = replayed
-        flown = self.twin.replay(states[:, 0], exogenous, actions, start=start)
-        return identification_cost(self.twin.plant, flown, states, seen).mean()
+        return identification_cost(self.twin.plant, self._flown(replayed), replayed.states, replayed.seen).mean()
+
+    def _flown(self, replayed: Trajectory) -> Trajectory:
+        states, actions, exogenous, start, _ = replayed
+        return self.twin.replay(states[:, 0], exogenous, actions, start=start)
 
     @torch.no_grad()
     def cost_of(self, whole: Trajectory) -> float:
@@ -243,15 +248,23 @@ class Assimilation:
                 record.readings[0] = math.nan
         return records, noise
 
+    @torch.no_grad()
     def _rms(self, replayed: Trajectory) -> Float[Tensor, " n_y"]:
         """RMS error of every state that J_p compares; infinite if the twin diverges."""
-        records, noise = self._compared(replayed)
-        if self.config.initial == "measured":
-            return judged(self._problem.likelihood(records, noise)).rms
         try:
-            return judged(self._problem.fit_initial_states(records, noise)).rms
+            if self.config.initial == "estimated":
+                return judged(self._problem.fit_initial_states(*self._compared(replayed))).rms
+            flown = self._flown(replayed)
         except FloatingPointError:
-            return torch.full_like(noise, math.inf)
+            return replayed.states.new_full((len(self._problem.sensors),), math.inf)
+        plant = self.twin.plant
+        places = [k for k, scale in enumerate(plant.discrepancy_scales) if scale < math.inf]
+        signals = [plant.states[k] for k in places]
+        errors = differences(signals, flown.states[..., places], replayed.states[..., places])
+        errors[:, 0] = math.nan  # no error is seen where a replay begins
+        if replayed.seen is not None:
+            errors = torch.where(replayed.seen.unsqueeze(-1), errors, math.nan)
+        return errors.flatten(0, 1).square().nanmean(0).sqrt()
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.

@@ -157,14 +157,15 @@ class Belief:
         """
         state = self.virtual.twin.state_dict()
         if self._differences is None or not equal(state, self._differences[0]):
-            self._differences = copy.deepcopy(state), [self._difference(one) for one in self.flown]
+            differences = list[float]()
+            for flown in self.flown:
+                d = math.nan
+                if not isinstance(self._policies[flown.role], StateFeedback):
+                    predicted = self.virtual.cost(self.policy_of(flown), self.virtual.repeated(flown.trajectory))
+                    d = difference(flown.cost, predicted)
+                differences.append(d)
+            self._differences = copy.deepcopy(state), differences
         return self._differences[1]
-
-    def _difference(self, flown: Flown) -> float:
-        if isinstance(self._policies[flown.role], StateFeedback):
-            return math.nan
-        predicted = self.virtual.cost(self.policy_of(flown), self.virtual.repeated(flown.trajectory))
-        return difference(flown.cost, predicted)
 
     def examine(self) -> TensorDict:
         """Fly the latest real episodes on the present twin.
@@ -213,7 +214,7 @@ class Belief:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
         if not self.corrects or not 0.0 < cost < math.inf:
             return cost
-        anchors, weights = self._anchors(), dict(policy.state_dict())
+        anchors, weights = self.anchors(), dict(policy.state_dict())
         pairs = zip(self.differences(), self.flown, strict=True)
         flown = [d for d, one in pairs if one.exploration <= QUIET and equal(one.weights, weights)]
         if anchors is not None and flown and not any(map(math.isnan, flown)):
@@ -235,7 +236,7 @@ class Belief:
         Raises:
             DivergenceError: if a replay diverges under the policy.
         """
-        anchors = self._anchors()
+        anchors = self.anchors()
         if anchors is None or isinstance(policy, StateFeedback):
             return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
         replays = anchors.replays.latest(latest)
@@ -244,12 +245,7 @@ class Belief:
         precisions = 1.0 / (anchors.noise + anchors.growth * alike * apart)
         return (((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()).clamp(max=DEARER)
 
-    @property
-    def contradicted(self) -> bool:
-        """Whether real episodes correct the twin."""
-        return self._anchors() is not None
-
-    def _anchors(self) -> "Anchors | None":
+    def anchors(self) -> "Anchors | None":
         """The latest whole episodes on the present twin; None without any, and while the twin is right."""
         twin = self.virtual.twin
         state = twin.state_dict()
@@ -381,15 +377,12 @@ def alarm(differences: Sequence[float]) -> str | None:
         differences: d of the latest quiet episodes, oldest first.
     """
     last = list(differences[-2:])
-    if len(last) == 2 and (min(last) > ALARM or max(last) < -ALARM):
-        return wrong(last)
-    return wrong(last[-1:]) if last and abs(last[-1]) > 2.0 * ALARM else None
-
-
-def wrong(differences: Sequence[float]) -> str:
-    """What is wrong with a twin of which the last episodes have these differences, in plain words."""
-    mean = sum(differences) / len(differences)
-    ratio, n = math.exp(abs(mean)), len(differences)
+    if len(last) < 2 or not (min(last) > ALARM or max(last) < -ALARM):
+        last = [d for d in last[-1:] if abs(d) > 2.0 * ALARM]
+    if not last:
+        return None
+    mean, n = sum(last) / len(last), len(last)
+    ratio = math.exp(abs(mean))
     episodes = "the last episode cost" if n == 1 else f"the last {n} episodes cost"
     relation = f"{ratio:.3g} times as much as" if mean > 0.0 else f"1/{ratio:.3g} of what"
     return f"the twin is wrong where it matters: {episodes} {relation} the twin says of {'it' if n == 1 else 'them'}"

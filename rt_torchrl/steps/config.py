@@ -142,13 +142,8 @@ class PlannerConfig:
     window: AtLeastOne = 25
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
-    @property
-    def whole(self) -> bool:
-        """Whether plans descend over whole episodes."""
-        return self.method in ("multi_start", "single_start")
-
     def __post_init__(self) -> None:
-        if self.constraints.states and not self.whole:
+        if self.constraints.states and self.method not in ("multi_start", "single_start"):
             raise ValueError(
                 f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
                 "planner.method as it is, or leave the constraints out."
@@ -307,11 +302,6 @@ class TwinningConfig:
     def experience(self) -> int:
         """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
         return max(self.records, 1 if self.planner.method == "single_start" else EXPERIENCE)
-
-    @property
-    def bounded_states(self) -> dict[str, tuple[float, float]]:
-        """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
-        return {**self.limits.states, **self.planner.constraints.states}
 
 
 PAPER = TwinningConfig(

@@ -42,19 +42,13 @@ class Constraints:
         self.multipliers = [0.0 for _ in self.bounds.names]
         self._excess = list(self.multipliers)
 
-    def __bool__(self) -> bool:
-        """Whether there is any bound."""
-        return bool(self.bounds.names)
-
     def costs(self, twin: DigitalTwin, policy: nn.Module, episodes: Scenario) -> Float[Tensor, " batch"]:
         """The expected costs of virtual episodes and of their price, differentiable by the policy's weights."""
-        found = twin.episode_costs(policy, *episodes)
-        return twin.corrected(policy, self.priced(found, twin.control(policy, *episodes)) if self else found)
+        costs = twin.episode_costs(policy, *episodes)
+        return twin.corrected(policy, self.priced(costs, twin.control(policy, *episodes)))
 
     def priced(self, costs: Float[Tensor, " batch"], flown: Trajectory) -> Float[Tensor, " batch"]:
         """J_a of trajectories with their price."""
-        if not self:
-            return costs
         self.reference = self.reference or abs(costs.mean().item()) or 1.0
         rho, sides = self.config.weight, self.bounds.beyond(flown.states[:, 1:])
         forces = [torch.relu(side.new_tensor(self.multipliers) + rho * side) for side in sides]

@@ -21,9 +21,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
-from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.belief import Belief, equal
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.report import findings, merged, same_architecture
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -178,8 +177,16 @@ class Imitation:
         return self._match(pupil, [self._of_record(record)])
 
     def _match(self, pupil: nn.Module, pairs: list[tuple[Tensor, Tensor]]) -> float:
+        """Fit the pupil's actions in place by the mean square of differences; the RMS, as a share of the ranges."""
         observations, actions = (torch.cat(part) for part in zip(*pairs, strict=True))
-        return match_actions(self.virtual.twin.plant, actions, pupil, observations, ITERATIONS)
+        low, high = bounds(self.virtual.twin.plant.actions, device=observations.device)
+        target = (actions - low) / (high - low)
+
+        def loss() -> Tensor:
+            shares = (pupil(observations) - low) / (high - low)
+            return nn.functional.mse_loss(shares, target, reduction="none").mean()
+
+        return Descent(pupil, DescentConfig(optimiser="lbfgs", rate=1.0)).run(loss, ITERATIONS).best ** 0.5
 
     @torch.no_grad()
     def _flown(self, teacher: nn.Module, policy: nn.Module, episodes: Scenario) -> tuple[Tensor, Tensor]:
@@ -187,20 +194,18 @@ class Imitation:
 
         A twin that lacks dynamics of the real system may blow up in a flight, and says nothing of what comes after.
         """
+        plant, like = self.virtual.twin.plant, episodes.initial_state
         try:
-            observations, actions = self._all_flown(teacher, policy, self.virtual.twin.control(policy, *episodes))
+            flown = self.virtual.twin.control(policy, *episodes)
+            if isinstance(teacher, StateFeedback):
+                along = flown.actions if policy is teacher else commands_along(teacher, flown, plant.dt)
+                observations, actions = self._of_record(flown._replace(actions=along))
+            else:
+                observations, actions = self._asked(teacher, self._observed(flown))
         except DivergenceError:
-            plant, like = self.virtual.twin.plant, episodes.initial_state
             return like.new_empty(0, len(plant.observations)), like.new_empty(0, len(plant.actions))
         sound = (observations.abs() <= BLOWN_UP).all(-1) & actions.isfinite().all(-1)
         return observations[sound], actions[sound]
-
-    def _all_flown(self, teacher: nn.Module, policy: nn.Module, flown: Trajectory) -> tuple[Tensor, Tensor]:
-        if not isinstance(teacher, StateFeedback):
-            return self._asked(teacher, self._observed(flown))
-        if policy is teacher:
-            return self._of_record(flown)
-        return self._of_record(flown._replace(actions=commands_along(teacher, flown, self.virtual.twin.plant.dt)))
 
     @torch.no_grad()
     def _asked(self, teacher: nn.Module, observations: Float[Tensor, "n n_o"]) -> tuple[Tensor, Tensor]:
@@ -223,36 +228,6 @@ class Imitation:
         return values[:: max(1, -(-len(values) // SAMPLES))]  # of none, none is left
 
 
-def match_actions(
-    plant: Plant,
-    wanted: Float[Tensor, "n n_a"],
-    student: nn.Module,
-    observations: Float[Tensor, "n n_o"],
-    iterations: int,
-) -> float:
-    """Fit the student's actions to a teacher's in place: behaviour cloning by the mean square of their difference.
-
-    Args:
-        plant: plant that gives the ranges of the actions.
-        wanted: the teacher's actions.
-        student: policy whose weights are trained, from their present values.
-        observations: observations on which the two are to agree.
-        iterations: gradients of the loss on all observations.
-
-    Returns:
-        RMS difference between the actions as a share of their ranges.
-    """
-    low, high = bounds(plant.actions, device=observations.device)
-
-    def share(action: Tensor) -> Tensor:
-        return (action - low) / (high - low)
-
-    target = share(wanted)
-    descent = Descent(student, DescentConfig(optimiser="lbfgs", rate=1.0))
-    loss = functools.partial(nn.functional.mse_loss, target=target, reduction="none")
-    return descent.run(lambda: loss(share(student(observations))).mean(), iterations).best ** 0.5
-
-
 def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module], Result]) -> dict[Role, Result]:
     """What ``flown`` returns for each policy; it is called once if the two are clones of each other.
 
@@ -267,7 +242,4 @@ def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module]
 
 def clones(first: nn.Module, second: nn.Module) -> bool:
     """Whether two policies are the same function with the same weights."""
-    if not same_architecture(first, second):
-        return False
-    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
-    return all(torch.equal(one, other) for one, other in pairs)
+    return same_architecture(first, second) and equal(first.state_dict(), second.state_dict())

@@ -285,10 +285,6 @@ class VirtualEpisodes:
         """Initial state of the last whole real episode."""
         self.extremes = extreme_states(twin.plant, extremes, generator.device)
 
-    def wanting(self, arm: str) -> bool:
-        """Whether an arm with a twin still needs the inputs of one whole real episode."""
-        return arm != "model_free" and not self.processes
-
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state."""
         self.processes.append(self._process(record))
@@ -358,7 +354,7 @@ class VirtualEpisodes:
     def price(self, policy: nn.Module, episodes: Scenario) -> float:
         """Mean J_a, with the price of leaving the bounds if there are some."""
         cost = self.cost(policy, episodes)
-        if not self.constraints or not math.isfinite(cost) or isinstance(policy, StateFeedback):
+        if self.constraints is None or not math.isfinite(cost) or isinstance(policy, StateFeedback):
             return cost
         flown = self.twin.control(policy, *episodes)
         return self.constraints.priced(flown.states.new_full((len(flown.states),), cost), flown).mean().item()

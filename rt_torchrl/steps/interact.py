@@ -1,7 +1,7 @@
 """Step 1: one episode on the real system, what of it is sound, and which policy may act."""
 
 import copy
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -35,16 +35,7 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 
 class ShortTermMemory(deque[Trajectory]):
-    """The records of the last ``capacity`` real episodes, oldest first."""
-
-    def __init__(self, capacity: int):
-        if capacity < 1:
-            raise ValueError(f"capacity={capacity} of the short-term memory (n_S) must be at least 1.")
-        super().__init__(maxlen=capacity)
-
-    def whole(self, n_steps: int, *, latest: int = 0) -> bool:
-        """Whether the latest records, or all with 0, are those of whole episodes of ``n_steps`` control intervals."""
-        return all(len(record.actions) == n_steps for record in list(self)[-latest:])
+    """The records of the last ``maxlen`` real episodes, oldest first."""
 
     def state_dict(self) -> dict[str, Any]:
         return {"records": [record._asdict() for record in self]}
@@ -66,18 +57,18 @@ class Flight(NamedTuple):
     Attributes:
         transitions: the transitions of its longest sound part, whose action is the applied one.
         record: the trajectory of that part; its clock says where it begins.
+        parts: the transitions of all sound parts, in their order.
         refused: why earlier attempts could not be learned from.
         faults: faults of the system in this episode and in the earlier attempts.
-        others: transitions of its other sound parts, each with the number of its first interval.
         whole: whether the record is that of a whole episode, to its horizon or to its early end.
         after: number of control intervals after an early end, and what each of them costs, L_e.
     """
 
     transitions: TensorDict
     record: Trajectory
+    parts: Sequence[TensorDict]
     refused: Sequence[str] = ()
     faults: Sequence[Fault] = ()
-    others: Sequence[tuple[int, TensorDict]] = ()
     whole: bool = True
     after: tuple[int, float] = (0, 0.0)
 
@@ -92,15 +83,10 @@ class Flight(NamedTuple):
         rewards, (count, each) = self.transitions["next", "reward"], self.after
         return -(rewards.sum() - count * each) / (len(rewards) + count)
 
-    def parts(self, dt: float) -> list[TensorDict]:
-        """The transitions of all sound parts, in their order."""
-        first = round(float(self.record.start) / dt)
-        return [part for _, part in sorted([(first, self.transitions), *self.others], key=lambda part: part[0])]
-
     @property
     def sound_intervals(self) -> int:
         """Number of control intervals that are learned from."""
-        return sum(map(len, (self.transitions, *(part for _, part in self.others))))
+        return sum(map(len, self.parts))
 
     def report(self) -> TensorDict:
         """The cost, the faults, and how often and why the episode was flown again."""
@@ -109,10 +95,8 @@ class Flight(NamedTuple):
             found.update(findings(episodes_refused=float(len(self.refused))))
             found.set_non_tensor("refusal", "; ".join(self.refused))
         if self.faults:
-            counts = {fault.kind: 0.0 for fault in self.faults}
-            for fault in self.faults:
-                counts[fault.kind] += 1.0
-            found.update(findings(**{f"faults/{kind}": count for kind, count in counts.items()}))
+            counts = Counter(fault.kind for fault in self.faults)
+            found.update(findings(**{f"faults/{kind}": float(count) for kind, count in counts.items()}))
         if self.ended:
             found.update(findings(ended_after=float(len(self.transitions))))
         if not self.whole:
@@ -129,12 +113,12 @@ def together(flights: Sequence[Flight]) -> TensorDict:
     return report
 
 
-def flown(flights: Sequence[Flight], dt: float) -> TensorDict:
+def flown(flights: Sequence[Flight]) -> TensorDict:
     """The record of the last of some flights, and the transitions of all their sound parts."""
     last = flights[-1]
     record = last.record
     flag = partial(torch.tensor, device=record.states.device)
-    parts = [part for flight in flights for part in flight.parts(dt)]
+    parts = [part for flight in flights for part in flight.parts]
     return TensorDict(
         {
             "record": {
@@ -170,15 +154,11 @@ class RealFlights:
         self.env, self.actor, self.rollout, self.plant = env, actor, rollout, plant
         self._least = max(SHORTEST, LEAST_SOUND * plant.n_steps)
         self.faults: list[Fault] = []
-        """Faults of the system in the episodes since :meth:`begin`."""
+        """Faults of the system since the episode of the algorithm began."""
         self.latest: Flight | None = None
         """The flight that was flown last."""
         self.check: Callable[[Trajectory], None] | None = None
         """What looks at the record of the first flight, before anything is learned from it, and may raise."""
-
-    def begin(self) -> None:
-        """Begin an episode of the algorithm."""
-        self.faults = []
 
     def fly(self, policy: nn.Module, *, strength: float, whole: bool) -> Flight:
         """Fly one episode.
@@ -204,13 +184,13 @@ class RealFlights:
             refused.append(found.reason)
             if len(refused) == FLIGHTS:
                 raise ValueError(tried_in_vain(refused)) from cause
-        others = [(part[0], _transitions(episode, part)) for part in found.parts if part != (first, last)]
-        transitions = _transitions(episode, (first, last))
+        parts = [_transitions(episode, part) for part in found.parts]
+        transitions = parts[found.parts.index((first, last))]
         states = torch.cat([transitions["state"], transitions["next", "state"][-1:]])
         start = first * self.plant.dt
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if found.whole else (0, 0.0)
-        self.latest = Flight(transitions, record, refused, faults, others, found.whole, after)
+        self.latest = Flight(transitions, record, parts, refused, faults, found.whole, after)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
@@ -278,11 +258,13 @@ class Clearance:
     def __init__(
         self, env: EnvBase, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, config: OperatingLimitsConfig
     ):
-        if config:
+        self.limited = bool(config)
+        if self.limited:
             require_layer(env)
         self.policies, self.virtual, self.config = policies, virtual, config
         self.limits = OperatingLimits(virtual.twin.plant, config)
-        self._last: tuple[Role, dict[str, Tensor]] | None = None
+        self._last: dict[str, Any] | None = None
+        """The role and weights that were cleared last."""
 
     @torch.no_grad()
     def choose(self, live: Role, count: int) -> Cleared:
@@ -299,13 +281,13 @@ class Clearance:
         Raises:
             ValueError: if no policy may act.
         """
-        if not self.config or not self.virtual.processes:
+        if not self.limited or not self.virtual.processes:
             return Cleared(self.policies[live], live, findings())
         episodes, reasons = self.virtual.draw(count), list[str]()
         for role in (live, *(other for other in ROLES if other != live)):
             share = self.predicted(self.policies[role], episodes)
             if share <= self.config.tolerated:
-                self._last = role, copy.deepcopy(self.policies[role].state_dict())
+                self._last = {"role": role, "weights": copy.deepcopy(self.policies[role].state_dict())}
                 return Cleared(self.policies[role], role, findings(*reasons, predicted_violations=share))
             reasons.append(f"{role} may not act: it would leave the limits in {100.0 * share:.3g} % of the intervals")
         if self._last is None:
@@ -313,9 +295,9 @@ class Clearance:
                 f"no policy may act. {'; '.join(reasons)}; limits.tolerated={self.config.tolerated}. Widen the limits "
                 "or raise that share, or begin with something that keeps the limits, such as --start controller."
             )
-        role, weights = self._last
+        role = self._last["role"]
         policy = copy.deepcopy(self.policies[role])
-        policy.load_state_dict(weights)
+        policy.load_state_dict(self._last["weights"])
         return Cleared(policy, role, findings(*reasons, predicted_violations=self.predicted(policy, episodes)))
 
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
@@ -329,18 +311,14 @@ class Clearance:
 
     def counted(self, flown: Trajectory) -> TensorDict:
         """Numbers of control intervals of a real episode beyond each kind of limits; nothing without limits."""
-        if not self.config:
-            return findings()
-        broken = self.limits.broken(flown)
+        broken = self.limits.broken(flown) if self.limited else {}
         return findings(**{f"violations/{kind}": found.sum().double() for kind, found in broken.items()})
 
     def state_dict(self) -> dict[str, Any]:
-        """The role and weights that were cleared last."""
-        return {"last": None if self._last is None else {"role": self._last[0], "weights": self._last[1]}}
+        return {"last": self._last}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        last = state["last"]
-        self._last = None if last is None else (last["role"], last["weights"])
+        self._last = state["last"]
 
 
 class Operating:
@@ -390,8 +368,7 @@ class Operating:
         while not policy_flew or self.operation.waiting():
             if flights and flights[-1].whole and self.step.config.arm != "model_free":
                 self.step.virtual.learn(flights[-1].record)  # step 3 fits the last one
-            needed = self.step.virtual.wanting(self.step.config.arm)
-            flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=needed)
+            flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=self.step.wanting)
             self.step.short_term.append(flight.record)
             flights.append(flight)
             order = self._order_of(flight)
@@ -456,24 +433,29 @@ class Interact(Step):
         config: TwinningConfig,
         judged: int,
     ):
-        short_term = ShortTermMemory(config.records)
+        short_term = ShortTermMemory(maxlen=config.records)
         super().__init__(env=env, clearance=clearance, short_term=short_term)
         self.short_term, self.policies, self.flights = short_term, policies, flights
         self.clearance, self.belief, self.virtual = clearance, belief, belief.virtual
         self.config, self.judged = config, judged
         self.operating = Operating(env, self) if isinstance(env, Operation) else None
 
+    @property
+    def wanting(self) -> bool:
+        """Whether a twin still needs the inputs of one whole real episode."""
+        return self.config.arm != "model_free" and not self.virtual.processes
+
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        self.flights.begin()
+        self.flights.faults = []
         live, number = episode["live"], int(episode["number"])
         flights, report = (self.operating or self).take(live, number)
-        return merged(episode.update(flown(flights, self.virtual.twin.plant.dt)), report)
+        return merged(episode.update(flown(flights)), report)
 
     def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
         """One episode of the policy that may act, the live one if it is cleared."""
         cleared = self.clearance.choose(live, self.judged)
         acting, strength = cleared.policy, self.config.exploration.strength(number)
-        flight = self.flights.fly(acting, strength=strength, whole=self.virtual.wanting(self.config.arm))
+        flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
         self.short_term.append(flight.record)
         explored = self.flights.actor.strength * self.config.exploration.spread
         if flight.whole:  # costs of parts cannot be compared with those of episodes

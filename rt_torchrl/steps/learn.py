@@ -26,7 +26,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn.utils import parameters_to_vector
 from torch.optim.adam import adam
 from torch.utils._pytree import tree_flatten
-from torchrl.data import Bounded, LazyTensorStorage, MultiStep, TensorDictPrioritizedReplayBuffer, Writer
+from torchrl.data import Bounded, LazyTensorStorage, MultiStep, RoundRobinWriter, TensorDictPrioritizedReplayBuffer
 from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, SoftUpdate, TD3Loss
 
@@ -196,12 +196,11 @@ class ScaledPolicy(nn.Module):
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("half_range", 0.5 * (high - low))
         self.policy = policy
-        self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
-        with torch.no_grad():
-            self.log_spread.weight.zero_()
-            self.log_spread.bias.fill_(-1.0)
-        if not stochastic:
-            del self.log_spread
+        self.log_spread = None
+        if stochastic:
+            self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
+            nn.init.zeros_(self.log_spread.weight)
+            nn.init.constant_(self.log_spread.bias, -1.0)
 
     def scaled(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         """Actions from their range to [−1, 1]."""
@@ -209,7 +208,7 @@ class ScaledPolicy(nn.Module):
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Tensor | tuple[Tensor, Tensor]:
         share = self.scaled(self.policy(observation))
-        if not hasattr(self, "log_spread"):
+        if self.log_spread is None:
             return share
         spread = self.log_spread(observation).clamp(self.LEAST, self.GREATEST).exp()
         return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
@@ -282,14 +281,11 @@ class ActorCritic:
         named = [(name, w) for name, w in self.loss.named_parameters() if w.requires_grad]
         self.critic_adam = Adam([w for name, w in named if "value_network" in name], config.critic_rate)
         self.actor_adam = Adam([w for name, w in named if "value_network" not in name], config.actor_rate)
+        self.shortest = config.return_steps
+        """Least number of control intervals in a row that can be stored."""
         self._returns = MultiStep(config.discount, config.return_steps)
         self._iterations: dict[tuple[Any, ...], Iteration] = {}
         self._traced = copy.deepcopy(policy)
-
-    @property
-    def shortest(self) -> int:
-        """Least number of control intervals in a row that can be stored."""
-        return self.config.return_steps
 
     def store(self, episode: TensorDictBase) -> None:
         """Keep the transitions of a real episode, with their TD errors as priorities.
@@ -453,6 +449,8 @@ class Adam:
         self.weights, self.rate = weights, rate
         self.moments = [[torch.zeros_like(w, requires_grad=False) for w in weights] for _ in range(2)]
         self.steps = [torch.zeros((), dtype=torch.float32, device=w.device) for w in weights]
+        self.parts = [*self.moments[0], *self.moments[1], *self.steps]
+        """All tensors of its state."""
 
     @torch.no_grad()
     def step(self, gradients: list[Tensor]) -> None:
@@ -476,18 +474,14 @@ class Adam:
 
     def restart(self) -> None:
         """Forget all steps."""
-        for part in self.parts():
+        for part in self.parts:
             part.zero_()
 
-    def parts(self) -> list[Tensor]:
-        """All tensors of its state."""
-        return [*self.moments[0], *self.moments[1], *self.steps]
-
     def state_dict(self) -> dict[str, Any]:
-        return {"parts": [part.clone() for part in self.parts()]}
+        return {"parts": [part.clone() for part in self.parts]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        for part, saved in zip(self.parts(), state["parts"], strict=True):
+        for part, saved in zip(self.parts, state["parts"], strict=True):
             part.copy_(saved)
 
 
@@ -561,7 +555,7 @@ class Iteration:
         """The iteration as a flat graph, or as it is where it cannot be traced; nothing is changed."""
         learner = self.learner
         state = [*learner.loss.parameters(), *learner.loss.buffers()]
-        state += [*learner.critic_adam.parts(), *learner.actor_adam.parts()]
+        state += [*learner.critic_adam.parts, *learner.actor_adam.parts]
         before = [part.detach().clone() for part in state]
         device = learner.generator.device
         try:
@@ -720,7 +714,7 @@ MakeReplay = Callable[..., LongTermMemory]
 """Function of the capacity, ``correction=`` and ``generator=`` that makes a :class:`LongTermMemory`."""
 
 
-class LeastPriorityWriter(Writer):
+class LeastPriorityWriter(RoundRobinWriter):
     """A writer that fills the storage in order, and then overwrites the transitions with the least current priority.
 
     TorchRL's ``TensorDictMaxValueWriter`` ranks transitions by their value when they are written. The paper ranks them
@@ -735,9 +729,6 @@ class LeastPriorityWriter(Writer):
         self.priorities = np.zeros(capacity, dtype=np.float32)
         """Priority of the transition in each place; of equal ones the first goes first."""
 
-    def add(self, data: TensorDictBase) -> int:
-        return int(self.extend(data.unsqueeze(0))[0])
-
     def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
         stored, capacity, n = len(self._storage), len(self.priorities), len(data)
         if n > capacity:
@@ -751,21 +742,6 @@ class LeastPriorityWriter(Writer):
         data.set("index", index)
         self._storage.set(index, data)
         return index
-
-    def _empty(self, empty_write_count: bool = True) -> None:
-        """Forget nothing, because the storage knows its length and the memory its priorities."""
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore nothing; :class:`LongTermMemory` restores the priorities."""
-
-    def dumps(self, path: str) -> None:
-        """Write nothing; see :meth:`load_state_dict`."""
-
-    def loads(self, path: str) -> None:
-        """Read nothing; see :meth:`load_state_dict`."""
 
 
 MakeLearner = Callable[..., Learner]

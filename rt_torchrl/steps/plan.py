@@ -32,6 +32,8 @@ STRIDE = 1_000_003
 """Difference of the seeds of the random policies of two episodes."""
 SEEDS = 2**63
 """Number of seeds of a generator."""
+DESCENT = ("J_a_plan_before", "J_a_plan", "policy_gradient")
+"""What the report of a plan says of its descent."""
 
 
 @runtime_checkable
@@ -77,53 +79,51 @@ class WholeEpisodes:
         policy: policy π_mb, updated in place.
         config: parameters of step 5.
 
-    The attribute ``constraints`` prices what leaves the bounds of ``config.constraints``, in the plans and where the
-    algorithm compares policies on the twin. A plan leaves its multipliers as they are.
+    The attribute ``constraints`` prices what leaves the bounds of ``config.constraints``, if there are some, in the
+    plans and where the algorithm compares policies on the twin. A plan leaves its multipliers as they are.
     """
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
-        self.constraints = Constraints(twin.plant, config.constraints)
+        self.constraints = Constraints(twin.plant, config.constraints) if config.constraints.states else None
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
         found = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
-        if self._stalled(found.start, found.best, found.gradient):
+        if self.stalled(found.start, found.best, found.gradient):
             again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
             found = found._replace(best=again.best, iterations=found.iterations + again.iterations)
         return found
 
-    def stalled(self, plan: TensorDict) -> bool:
-        """Whether the plan of a report gained nothing, or was none, although its first gradient exceeds the limit."""
-        if "policy_gradient" not in plan:
-            return True
-        return self._stalled(*(plan[key].item() for key in ("J_a_plan_before", "J_a_plan", "policy_gradient")))
-
-    def _stalled(self, before: float, after: float, gradient: float) -> bool:
+    def stalled(self, before: float, after: float, gradient: float) -> bool:
+        """Whether a plan gained nothing although its first gradient exceeds the limit."""
         if self.config.method == "single_start":
             return False
         weights = [w.detach() for w in self.policy.parameters() if w.requires_grad]
         return stuck(before, after, gradient, weights, GRADIENT_LIMIT)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
-        costs = self.constraints.costs(self.twin, self.policy, episodes)
+        if self.constraints is None:
+            costs = self.twin.expected_costs(self.policy, *episodes)
+        else:
+            costs = self.constraints.costs(self.twin, self.policy, episodes)
         return limited_mean(costs, self.policy.parameters(), limit)
-
-    def refuse(self) -> None:
-        """Forget the state of the optimiser, because it led to the plan that was refused."""
-        self.restart()
 
     def restart(self) -> None:
         """Forget the state of the optimiser."""
         self.descent.restart()
 
+    def refuse(self) -> None:
+        """Forget the state of the optimiser, because it led to the plan that was refused."""
+        self.restart()
+
     def state_dict(self) -> dict[str, Any]:
-        priced = {"constraints": self.constraints.state_dict()} if self.constraints else {}
+        priced = {} if self.constraints is None else {"constraints": self.constraints.state_dict()}
         return self.descent.state_dict() | priced
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if self.constraints:
+        if self.constraints is not None:
             self.constraints.load_state_dict(state["constraints"])
         self.descent.load_state_dict({name: part for name, part in state.items() if name != "constraints"})
 
@@ -156,11 +156,10 @@ class RecedingHorizonPlanner:
         cost = self.twin.cost(self.policy, episodes.initial_state[:count], episodes.exogenous[:count]).item()
         return Descended(cost, cost, 0.0, 0)
 
-    def refuse(self) -> None:
-        """Do nothing: there are no weights to go back to."""
-
     def restart(self) -> None:
-        """Do nothing: the closure has jumped back, and the controller plans on it as it is."""
+        """Do nothing: there are no weights, and the controller plans on the closure as it is."""
+
+    refuse = restart
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: the forecast belongs to the controller."""
@@ -183,17 +182,16 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
         ValueError: if the method is receding_horizon and the policy is not :class:`PredictiveControl`, or the other way
             round.
     """
+    if isinstance(policy, PredictiveControl) != (config.method == "receding_horizon"):
+        raise ValueError(
+            f"method={config.method!r} of the planning does not go with a policy of class {type(policy).__name__}: "
+            "receding_horizon needs model_based=PredictiveControl(twin.plant, twin.closure, ...), and it alone."
+        )
     if isinstance(policy, PredictiveControl):
-        if config.method == "receding_horizon":
-            return RecedingHorizonPlanner(twin, policy, config)
-    elif config.method != "receding_horizon":
-        if config.method == "short_horizon":
-            return ShortHorizon(twin, policy, config, generator=generator)
-        return WholeEpisodes(twin, policy, config)
-    raise ValueError(
-        f"method={config.method!r} of the planning does not go with a policy of class {type(policy).__name__}: "
-        "receding_horizon needs model_based=PredictiveControl(twin.plant, twin.closure, ...), and it alone."
-    )
+        return RecedingHorizonPlanner(twin, policy, config)
+    if config.method == "short_horizon":
+        return ShortHorizon(twin, policy, config, generator=generator)
+    return WholeEpisodes(twin, policy, config)
 
 
 MakePlanner = Callable[..., Planner]
@@ -251,7 +249,8 @@ class MultiStart:
         self.make_policy = make_policy or self.virtual.twin.plant.make_policy
         self._first: Weights | None = None
         self._stalled = 0
-        drawn = self.make_policy(self._generator(0)) if self.count else planner.policy
+        device = self.virtual.generator.device
+        drawn = self.make_policy(torch.Generator(device=device)) if self.count else planner.policy
         self.alike = same_architecture(drawn, planner.policy)
         if make_policy is not None and not self.alike:
             raise ValueError(
@@ -286,7 +285,8 @@ class MultiStart:
             self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
-        corrected = isinstance(self.planner, WholeEpisodes) and self.belief.corrects and self.belief.contradicted
+        whole = isinstance(self.planner, WholeEpisodes)
+        corrected = whole and self.belief.corrects and self.belief.anchors() is not None
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
         recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < stays else []
         if several or recalled:
@@ -304,11 +304,18 @@ class MultiStart:
     ) -> Plan:
         """The best of a plan and of those from other weights; the policy gets its weights."""
         after, start = copy.deepcopy(self.planner.state_dict()), 0
+        policy = self.planner.policy
         for number, weights in others:
-            plan = self._from_others(weights, planned_on, judged_on)
-            if plan is not None and plan.cost < best.cost:
-                best, start = plan, number
-        self.planner.policy.load_state_dict(best.weights)
+            policy.load_state_dict(weights)
+            self.planner.restart()
+            try:
+                report = planned(self.planner.plan(planned_on))
+            except FloatingPointError:
+                continue  # the twin is sound with the present policy, so that these weights are to blame
+            cost = self.belief.judge(policy, judged_on)
+            if cost < best.cost:
+                best, start = Plan(copy.deepcopy(policy.state_dict()), cost, report), number
+        policy.load_state_dict(best.weights)
         if start:
             self.planner.restart()
         else:
@@ -317,8 +324,8 @@ class MultiStart:
 
     def _from_the_present(self, present: Weights, stays: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
         """A plan from the present weights, or these; one that fails from extreme starts is made again on these, too."""
-        policy, report = self.planner.policy, findings()
-        for episodes in (planned_on, self.virtual.with_extremes(planned_on)):
+        policy, episodes, report = self.planner.policy, planned_on, findings()
+        for _ in range(2):
             found = self._descended(episodes, usual=planned_on)
             if found is None:
                 return Plan(present, stays, findings("no plan: the twin diverges", plan_accepted=0.0))
@@ -330,18 +337,8 @@ class MultiStart:
             self.planner.refuse()
             if not len(self.virtual.extremes) or cost.price > stays.price:
                 break
+            episodes = self.virtual.with_extremes(planned_on)
         return Plan(present, stays, report.update(findings(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])))
-
-    def _from_others(self, weights: Weights, planned_on: Scenario, judged_on: Scenario) -> Plan | None:
-        """A plan that begins with other weights; None if the twin diverges under these."""
-        policy = self.planner.policy
-        policy.load_state_dict(weights)
-        self.planner.restart()
-        try:
-            report = planned(self.planner.plan(planned_on))
-        except FloatingPointError:
-            return None  # the twin is sound with the present policy, so that these weights are to blame
-        return Plan(copy.deepcopy(policy.state_dict()), self.belief.judge(policy, judged_on), report)
 
     def _descended(self, episodes: Scenario, usual: Scenario | None = None) -> TensorDict | None:
         """The report of a descent; None, and the weights as they were, if the twin diverges where it begins.
@@ -362,7 +359,9 @@ class MultiStart:
         """Whether to plan from other weights, too."""
         if not self.count or not isinstance(self.planner, WholeEpisodes):
             return False
-        self._stalled = self._stalled + 1 if self.planner.stalled(plan.report) else 0
+        report = plan.report  # without a gradient where the twin has diverged
+        descent = [report[key].item() for key in DESCENT if key in report]
+        self._stalled = self._stalled + 1 if len(descent) < len(DESCENT) or self.planner.stalled(*descent) else 0
         return episode in SEVERAL or self._stalled.bit_count() == 1
 
     def _others(
@@ -379,7 +378,9 @@ class MultiStart:
     @torch.no_grad()
     def _random(self, episode: int, planned_on: Scenario) -> Weights:
         """The weights of the random policy that costs least on the twin; what is not trained is not drawn."""
-        policy, generator = self.planner.policy, self._generator(episode)
+        policy, source = self.planner.policy, self.virtual.generator
+        seed = (source.initial_seed() + STRIDE * episode) % SEEDS
+        generator = torch.Generator(device=source.device).manual_seed(seed)
         kept = copy.deepcopy(policy.state_dict())
         trained = {name for name, weight in policy.named_parameters() if weight.requires_grad}
         best: tuple[float, Weights] = math.inf, kept
@@ -393,10 +394,6 @@ class MultiStart:
         policy.load_state_dict(kept)
         return best[1]
 
-    def _generator(self, episode: int) -> torch.Generator:
-        own = self.virtual.generator
-        return torch.Generator(device=own.device).manual_seed((own.initial_seed() + STRIDE * episode) % SEEDS)
-
     @torch.no_grad()
     def _raised(self, episodes: Scenario) -> TensorDict:
         """Raise the multipliers by the excess of the policy that stays, once all plans of this episode are judged.
@@ -404,7 +401,7 @@ class MultiStart:
         Plans and what they would replace are so compared at the same price. What a refused plan exceeds is no matter.
         """
         constraints = self.virtual.constraints
-        if not constraints:
+        if constraints is None:
             return findings()
         with contextlib.suppress(FloatingPointError):  # of a refused policy that diverges
             constraints.update(self.virtual.twin.control(self.planner.policy, *episodes))

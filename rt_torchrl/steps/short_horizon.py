@@ -111,18 +111,13 @@ class ShortHorizon:
         self.reference = self.reference or abs(control_cost(plant, flown).mean().item()) or 1.0
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
-        over = self._over(flown.states[:, : count * n : n])
-        begun = torch.full_like(rows, count) if over is None else (~over).sum(1)  # windows before an early end
+        begun = (~plant.ended(flown.states[:, : count * n : n])).sum(1)  # windows before an early end
         for shift in range(count):
             safe_point()
             phase = (rows + shift) % begun
             start = plant.dt * n * phase.double()
             norms.append(self._window(flown.states[rows, phase * n], inputs[rows, phase], start))
         return sum(norms) / len(norms)
-
-    def _over(self, states: Float[Tensor, "batch m n_s"]) -> Bool[Tensor, "batch m"] | None:
-        """Whether an episode has ended early by each of its states, in which it then stays; None if none ends early."""
-        return None if self.twin.plant.end_cost is None else self.twin.plant.ended(states)
 
     def _window(
         self,
@@ -138,29 +133,22 @@ class ShortHorizon:
         costs = cost_rate(plant, t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
         # There is no input after the last interval; the last input takes its place.
         seen = plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
-        over = self._over(flown.states)
+        over = plant.ended(flown.states)
         norm = self._improve_policy(costs, seen, over)
         self._improve_critic(costs.detach(), seen.detach(), over)
         return norm
 
-    def _values(
-        self, seen: Float[Tensor, "*batch n_o"], over: Bool[Tensor, "*batch"] | None
-    ) -> Float[Tensor, "*batch"]:
+    def _values(self, seen: Float[Tensor, "*batch n_o"], over: Bool[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """What the slow critic estimates, or the value of an end."""
-        found: Tensor = self.target(seen).squeeze(-1)
-        if over is None:
-            return found
-        return torch.where(over, (self.twin.plant.end_cost or 0.0) / self.reference, found)
+        end = (self.twin.plant.end_cost or 0.0) / self.reference
+        return torch.where(over, end, self.target(seen).squeeze(-1))
 
     def _improve_policy(
-        self,
-        costs: Float[Tensor, "batch n"],
-        seen: Float[Tensor, "batch m n_o"],
-        over: Bool[Tensor, "batch m"] | None = None,
+        self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"], over: Bool[Tensor, "batch m"]
     ) -> float:
         gamma, n = self.discount, costs.shape[1]
         weights = (1.0 - gamma) * gamma ** torch.arange(n, dtype=costs.dtype, device=costs.device)
-        J_w = (costs * weights).sum(-1) + gamma**n * self._values(seen[:, -1], None if over is None else over[:, -1])
+        J_w = (costs * weights).sum(-1) + gamma**n * self._values(seen[:, -1], over[:, -1])
         self._optimiser.zero_grad(set_to_none=True)
         J_w.mean().backward()
         norm = nn.utils.clip_grad_norm_(self.learner.parameters(), self.gradient_limit)
@@ -168,15 +156,12 @@ class ShortHorizon:
         return norm.item()
 
     def _improve_critic(
-        self,
-        costs: Float[Tensor, "batch n"],
-        seen: Float[Tensor, "batch m n_o"],
-        over: Bool[Tensor, "batch m"] | None = None,
+        self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"], over: Bool[Tensor, "batch m"]
     ) -> None:
         targets = self._targets(costs, seen, over)
         for _ in range(self.critic_iterations):
             errors = self.critic(seen[:, :-1]).squeeze(-1) - targets
-            loss = (errors if over is None else errors[~over[:, :-1]]).square().mean()
+            loss = errors[~over[:, :-1]].square().mean()
             self._critic_optimiser.zero_grad(set_to_none=True)
             loss.backward()
             self._critic_optimiser.step()
@@ -186,10 +171,7 @@ class ShortHorizon:
 
     @torch.no_grad()
     def _targets(
-        self,
-        costs: Float[Tensor, "batch n"],
-        seen: Float[Tensor, "batch m n_o"],
-        over: Bool[Tensor, "batch m"] | None = None,
+        self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"], over: Bool[Tensor, "batch m"]
     ) -> Float[Tensor, "batch n"]:
         """The critic's targets (1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), computed from the last interval."""
         gamma, mixing = self.discount, self.mixing

@@ -157,7 +157,8 @@ class RecordedFlights:
         return list(policies)
 
     def flights(self, fly: Fly) -> list[Flight]:
-        return [Flight(transitions_of(self.plant, record), record, []) for record in self.records]
+        flown = [(transitions_of(self.plant, record), record) for record in self.records]
+        return [Flight(transitions, record, [transitions]) for transitions, record in flown]
 
 
 def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:

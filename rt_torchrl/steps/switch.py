@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.steps.belief import Belief
@@ -15,7 +15,6 @@ from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
 from rt_torchrl.steps.plan import Planner
 from rt_torchrl.steps.report import Step, findings, merged, record_of
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 Event = Literal["keep", "swap", "clone"]
 
@@ -214,14 +213,9 @@ class Switch(Step):
         report = findings(*diverged, **{f"J_a_{role}": costs[role].price for role in ROLES})
         report = report.update(findings(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
         if event == "clone":
-            report = merged(report, self.clone(record_of(episode), judged_on))
+            policies, record = (self.policies[live], self.policies[idle]), record_of(episode)
+            cloned = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)
+            if "reason" not in cloned:
+                self.halves[idle].restart()
+            report = merged(report, cloned)
         return merged(episode, report)
-
-    def clone(self, record: Trajectory, judged_on: Scenario) -> TensorDict:
-        """Clone the live policy into the idle one, unless the clone is worse."""
-        live, idle = self.referee.live, self.referee.idle
-        policies = (self.policies[role] for role in (live, idle))
-        report = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)
-        if "reason" not in report:
-            self.halves[idle].restart()
-        return report

@@ -37,7 +37,8 @@ AGAIN = ("short",)
 STEPS = 10
 """Greatest number of Levenberg-Marquardt steps over segments in a stage."""
 HELD = 0.1
-"""Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
+"""Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one.
+Without this prior the weights that the records hardly show spoil the steps, and many weights follow noise."""
 FAR = 10.0
 """Ratio of misfits beyond which a stage has gone astray, or the weights of the last episode have."""
 LONGEST_PAUSE = 8
@@ -126,12 +127,8 @@ def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
         place = torch.searchsorted(measured, starts)
         starts = measured[place[place < len(measured)]]
     flag[starts] = 1.0
-    return at_rest(record, plant)._replace(exogenous=torch.cat([record.exogenous, read, flag], -1))
-
-
-def at_rest(record: Trajectory, plant: Plant) -> Trajectory:
-    """A record with the hidden states of a plant at rest, of which a replay takes those of the start."""
-    return record._replace(states=plant.at_rest(record.states))
+    exogenous = torch.cat([record.exogenous, read, flag], -1)
+    return record._replace(states=plant.at_rest(record.states), exogenous=exogenous)
 
 
 def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
@@ -194,19 +191,14 @@ class Fit:
         first, self.whole.length = math.isinf(self.least), length
         least, arrived = self._run(records, FIRST if first else AGAIN, generator)
         if not (first or arrived or least < FAR * self.least):
-            least = self._anew(records, least, generator)
+            present = copy.deepcopy(self.twin.closure.state_dict())
+            self.twin.closure.load_state_dict(self._first)
+            found, _ = self._run(records, FIRST, generator)
+            if not found < least:
+                self.twin.closure.load_state_dict(present)
+            least = min(found, least)
         self.least = least
         return least
-
-    def _anew(self, records: Sequence[Trajectory], least: float, generator: torch.Generator) -> float:
-        """Fit from the first weights; the present ones stay unless their misfit is greater."""
-        closure = self.twin.closure
-        present = copy.deepcopy(closure.state_dict())
-        closure.load_state_dict(self._first)
-        found, _ = self._run(records, FIRST, generator)
-        if not found < least:
-            closure.load_state_dict(present)
-        return min(found, least)
 
     def _run(
         self, records: Sequence[Trajectory], stages: Sequence[str], generator: torch.Generator
@@ -218,7 +210,8 @@ class Fit:
         """
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
-        self._hold(least)
+        if self._held and math.isfinite(least):  # see HELD
+            self.short.prior.stiffness = self.whole.prior.stiffness = HELD * least
         taken = {
             "short": (self.short, [reread(record, plant, self.segment) for record in records]),
             "whole": (self.whole, self.rested(records)),
@@ -242,21 +235,13 @@ class Fit:
         closure.load_state_dict(best)
         return least, arrived
 
-    def _hold(self, least: float) -> None:
-        """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
-
-        Without it the weights that the records hardly show spoil the steps, and many weights follow noise.
-        """
-        if self._held and math.isfinite(least):
-            self.short.prior.stiffness = self.whole.prior.stiffness = HELD * least
-
     def cost(self, records: Sequence[Trajectory]) -> float:
         """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
         return self.whole.cost_of(self.whole.in_segments(batch_of(self.rested(records))))
 
     def rested(self, records: Sequence[Trajectory]) -> list[Trajectory]:
-        """The records with the hidden states of the hypothesis at rest."""
-        return [at_rest(record, self.twin.plant) for record in records]
+        """The records with the hidden states of the hypothesis at rest, of which a replay takes those of the start."""
+        return [record._replace(states=self.twin.plant.at_rest(record.states)) for record in records]
 
     def state_dict(self) -> dict[str, Any]:
         counters = {"least": self.least, **self.turns.state_dict()}
@@ -336,24 +321,16 @@ class EnsembleAssimilation(Assimilation):
         Returns:
             The result of the twin alone. Where it rests, that is its present cost, without a gradient.
         """
-        self._before = self._believed_cost(records) if self.ensemble.hypothesis else None
-        found = self._fit_alone(records, processes, count, generator)
+        believed = self.fits.get(self.ensemble.likeliest)
+        self._before = None if believed is None else believed.cost(records)
+        if self.turns.due() or self.always or ALONE in self.ensemble.weights:
+            found = super().update(records, processes, count, generator)
+        else:
+            self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
+            found = Descended(cost, cost, math.nan, 0)
         if self.called:
             self._weigh(generator)
         return found
-
-    def _fit_alone(
-        self,
-        records: Sequence[Trajectory],
-        processes: Sequence[ExogenousProcess],
-        count: int,
-        generator: torch.Generator,
-    ) -> Descended:
-        """Fit the twin alone if that is due, or it is planned on; its gradient is not known where it rests."""
-        if self.turns.due() or self.always or ALONE in self.ensemble.weights:
-            return super().update(records, processes, count, generator)
-        self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
-        return Descended(cost, cost, math.nan, 0)
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
@@ -375,23 +352,17 @@ class EnsembleAssimilation(Assimilation):
     def _weigh(self, generator: torch.Generator) -> None:
         """Fit the hypotheses to the records of the last update, and weigh them."""
         records = self._records
-        alone = misfit(self.ensemble.twins[ALONE], records, self.segment)
-        misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
-        self.misfits = {ALONE: alone} | misfits
+        self.misfits = {ALONE: misfit(self.ensemble.twins[ALONE], records, self.segment)}
+        for name, fit in self.fits.items():
+            if fit.turns.due():
+                self.misfits[name] = fit.update(records, generator, self.length)
+            else:
+                self.misfits[name] = misfit(fit.twin, records, self.segment)
         shares = evidence(self.misfits)
         self.turns.rest(hopeless=shares[ALONE] < HOPELESS)
         for name, fit in self.fits.items():
             fit.turns.rest(hopeless=shares[name] < HOPELESS)
         self.ensemble.weights = counting(shares)
-
-    def _misfit(self, fit: Fit, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        if fit.turns.due():
-            return fit.update(records, generator, self.length)
-        return misfit(fit.twin, records, self.segment)
-
-    def _believed_cost(self, records: Sequence[Trajectory]) -> float:
-        """J_p of the likeliest hypothesis, not the twin alone, over what it was fitted to."""
-        return self.fits[self.ensemble.likeliest].cost(records)
 
     def report(self) -> dict[str, float | str]:
         """The weight and the misfit of every hypothesis, and what is said of the twin where a hypothesis is believed.
@@ -399,14 +370,13 @@ class EnsembleAssimilation(Assimilation):
         ``J_p`` is then that of the likeliest hypothesis, whose name is ``believed``, over the records of the last
         update; ``J_p_before`` is that of the one that was the likeliest before, as it was then.
         """
-        found: dict[str, float | str] = {}
-        for name in self.ensemble.twins:
-            found[f"hypothesis/{name}"] = self.ensemble.weights.get(name, 0.0)
+        weights, believed = self.ensemble.weights, self.fits.get(self.ensemble.likeliest)
+        found: dict[str, float | str] = {f"hypothesis/{name}": weights.get(name, 0.0) for name in self.ensemble.twins}
         found |= {f"misfit/{name}": value for name, value in self.misfits.items()}
         if self._before is not None:
             found["J_p_before"] = self._before
-        if self.ensemble.hypothesis is not None and self._records:
-            found |= {"J_p": self._believed_cost(self._records), "believed": self.ensemble.hypothesis}
+        if believed is not None and self._records:
+            found |= {"J_p": believed.cost(self._records), "believed": self.ensemble.likeliest}
         return {**found, **super().report()}
 
     def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
