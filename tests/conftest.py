@@ -1,10 +1,8 @@
-"""Fixtures that more than one file uses, and the table of the campaign of faults."""
+"""Fixtures that more than one file uses."""
 
 import os
 import signal
-from pathlib import Path
 
-import fault_counts
 import jaxtyping
 import pytest
 import torch
@@ -24,17 +22,3 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
-
-
-def pytest_addoption(parser):
-    parser.addoption("--faults-table", type=Path, help="file for the table of counts of the campaign of faults")
-
-
-def pytest_terminal_summary(terminalreporter, config):
-    if not fault_counts.COUNTS or "not faults" in config.getoption("markexpr"):
-        return
-    terminalreporter.section("faults")
-    terminalreporter.write_line(fault_counts.table())
-    path = config.getoption("--faults-table")
-    if path is not None:
-        fault_counts.write(path)

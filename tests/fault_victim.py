@@ -39,8 +39,6 @@ def shipped_run(name, folder, **options):
 
 def victim(folder, options, kill_at=None, plant=None):
     """A training in a process of its own; with ``kill_at`` it kills itself in its so manieth renaming of a file."""
-    if folder is None:
-        return
     with open(os.devnull, "w") as quiet, contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
         if kill_at is not None:
             rename, left = Path.replace, iter(range(kill_at))

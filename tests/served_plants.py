@@ -30,3 +30,24 @@ def served(plant, protocol, *, safe, period, seed=0):
         ended.set()
         work.join(30.0)
         assert not work.is_alive()
+
+
+@contextlib.contextmanager
+def in_a_thread(server):
+    """Enter an asynchronous context in a thread of its own; gives what it gives, and its event loop."""
+    begun, found = threading.Event(), {}
+
+    async def run():
+        found.update(loop=asyncio.get_running_loop(), ended=asyncio.Event())
+        async with server as found["value"]:
+            begun.set()
+            await found["ended"].wait()
+
+    work = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+    work.start()
+    assert begun.wait(30.0)
+    try:
+        yield found["value"], found["loop"]
+    finally:
+        found["loop"].call_soon_threadsafe(found["ended"].set)
+        work.join(30.0)

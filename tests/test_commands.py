@@ -122,7 +122,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known |= {"uv run --group nightly tests/peers.py"}  # tests/test_benchmark.py
     known |= {"uv run --extra tank docs/gallery.py"}  # tests/test_documentation.py
     known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
-    known |= {f"{PYTEST} -m faults", "uv run --group test --with atheris tests/fuzz.py wind.bts -max_total_time=60"}
+    known |= {f"{PYTEST} -m faults"}
     assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
 
@@ -142,7 +142,6 @@ FILES = [
     ".ci/nightly",
     ".pre-commit-config.yaml",
     "pyproject.toml",
-    "tests/fuzz.py",
     "tests/test_fault_campaign.py",
 ]
 

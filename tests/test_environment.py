@@ -69,15 +69,11 @@ def test_rows_of_a_batch_are_independent_systems():
     together = act(env, found, action)
     for row in range(3):
         single.reset()
-        single._state, single._exogenous = env_row(found["state"], row), env._exogenous[row : row + 1]
+        single._state, single._exogenous = found["state"][row : row + 1].clone(), env._exogenous[row : row + 1]
         alone = act(single, TensorDict({}, batch_size=[1]), action[row : row + 1])
         # Rounding of another vector length.
         for key in ("state", "reward"):
             torch.testing.assert_close(alone["next", key][0], together["next", key][row], rtol=1e-13, atol=1e-14)
-
-
-def env_row(tensor, row):
-    return tensor[row : row + 1].clone()
 
 
 def test_partial_reset_restarts_the_marked_rows_only():
@@ -121,11 +117,6 @@ def test_divergence_is_raised_with_time_state_and_command():
             found = act(env, found, uniform_actions(env, k))["next"].exclude("reward")
 
 
-def test_batch_size_is_checked():
-    with pytest.raises(ValueError, match="batch_size=0"):
-        PlantEnv(LinearQuadratic(), batch_size=0)
-
-
 def test_sensors_err_by_a_share_of_what_they_read():
     plant = LinearQuadratic(horizon=30.0, noise=0.0)
     clean, noisy = (PlantEnv(plant, batch_size=40, seed=1, noise=noise) for noise in (0.0, 0.02))
@@ -159,6 +150,7 @@ def test_the_real_system_wears_from_episode_to_episode():
     assert env.closure is worn[1]
 
 
-def test_noise_out_of_range_is_refused():
-    with pytest.raises(ValueError, match=r"noise=1.5 of the sensors"):
-        PlantEnv(LinearQuadratic(), noise=1.5)
+@pytest.mark.parametrize(("options", "message"), [({"batch_size": 0}, "batch_size=0"), ({"noise": 1.5}, "noise=1.5 ")])
+def test_arguments_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        PlantEnv(LinearQuadratic(), **options)

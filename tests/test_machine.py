@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import multiprocessing
 import os
 import threading
 import time
@@ -55,7 +56,7 @@ def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path
     config = module.Config().defaults()
     config = dataclasses.replace(config, pace=PACE, horizon=60.0, port=port, threads=1, log_dir=tmp_path / "run")
     plant, ended, lost, used = config.plant(), threading.Event(), [], []
-    with ServerProcess(plant, **config.served()) as server, contextlib.closing(Relay(port)) as relay:
+    with ServerProcess(plant, **config.served()), contextlib.closing(Relay(port)) as relay:
         served = config.served() | {"port": relay.port}
         run = Run(config, plant, env=partial(served_system, plant, **served, log=log), first=JonkmanController)
         algorithm, until = run.algorithm, float("inf")
@@ -67,7 +68,7 @@ def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path
                 if not used:  # the first round, which compiles, may take long
                     losing.start()
                     until = time.monotonic() + SECONDS
-                pids = os.getpid(), algorithm.operating.operation.pid, server.pid, relay.pid
+                pids = [os.getpid(), *sorted(process.pid for process in multiprocessing.active_children())]
                 used.append([(memory(pid), handles(pid)) for pid in pids])
         finally:
             ended.set()

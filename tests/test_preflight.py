@@ -53,12 +53,6 @@ class Machine(AroundSystem):
             sent = torch.where(torch.tensor(self.stays).isnan(), sent, torch.tensor(self.stays).double())
         return self.env.step(tensordict.exclude("next").set("action", sent))["next"].exclude("applied")
 
-    def state_dict(self, *args, **kwargs):
-        return self.env.state_dict()
-
-    def load_state_dict(self, state, *args, **kwargs):
-        self.env.load_state_dict(state)
-
 
 def wired(plant, *, real=None, noise=0.0, scale=1.0, offset=0.0, order=None, sent=None, **machine):
     """A real system, whose readings have a scale, an offset and an order, and whose commands a scale and an offset."""
@@ -74,29 +68,17 @@ def only(plant, column, value, other=1.0):
     return [value if k == column else other for k in range(len(plant.states))]
 
 
-SWAPPED = [1, 0, 2, 3, 4, 5]
+SWAPPED, TURN = [1, 0, 2, 3, 4, 5], 180.0 / math.pi
 MISTAKES = {
     "torque has the other sign": (PENDULUM, {"sent": (-1.0, 0.0)}, "action torque has the other sign"),
     "angle has the other sign": (PENDULUM, {"scale": only(PENDULUM, 0, -1.0)}, "state angle has the other sign"),
     "angle and speed in the other order": (PENDULUM, {"order": [1, 0]}, "angle and angular_speed are in the other"),
-    "degrees for radians": (
-        PENDULUM,
-        {"scale": only(PENDULUM, 0, 180.0 / math.pi)},
-        "angle is in deg, where",
-    ),
-    "rpm for rad/s": (
-        PENDULUM,
-        {"scale": only(PENDULUM, 1, 30.0 / math.pi)},
-        "angular_speed is in rpm, where",
-    ),
+    "degrees for radians": (PENDULUM, {"scale": only(PENDULUM, 0, TURN)}, "angle is in deg, where"),
+    "rpm for rad/s": (PENDULUM, {"scale": only(PENDULUM, 1, TURN / 6.0)}, "angular_speed is in rpm, where"),
     "torque one interval late": (PENDULUM, {"late": True}, "an action acts one interval late"),
     "torque does not arrive": (PENDULUM, {"stays": [0.5]}, "action torque does not arrive"),
     "speeds in the other order": (TURBINE, {"order": SWAPPED}, "rotor_speed and filtered_generator_speed are in the"),
-    "pitch in radians": (
-        TURBINE,
-        {"scale": only(TURBINE, 5, math.pi / 180.0)},
-        "blade_pitch is in rad, where",
-    ),
+    "pitch in radians": (TURBINE, {"scale": only(TURBINE, 5, 1.0 / TURN)}, "blade_pitch is in rad, where"),
     "pitch from the other end": (TURBINE, {"sent": ([1.0, -1.0], [0.0, 30.0])}, "blade_pitch runs from the other end"),
     "1 s for 0.5 s": (TURBINE, {"real": WindTurbine(dt=1.0, horizon=60.0)}, "dt is another one, 1 s and not 0.5 s"),
     "torque does not arrive, turbine": (TURBINE, {"stays": [2e4, math.nan]}, "action generator_torque does not arrive"),
@@ -115,7 +97,7 @@ QUICK = ("torque has the other sign", "degrees for radians", "torque one interva
 def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
     plant, wiring, words = MISTAKES[name]
     found = check_real_system(wired(plant, **wiring), plant)
-    assert not found.sound and words in found.mistakes[0].mistake and len(found.mistakes) <= 2
+    assert words in found.mistakes[0].mistake and len(found.mistakes) <= 2
     with pytest.raises(WiringError, match="the real system does not fit its plant") as raised:
         found.require()
     assert words in str(raised.value) and f"{plant.states[0].name}: moves by" in str(raised.value)
@@ -178,7 +160,7 @@ def test_intervals_that_begin_or_end_with_a_refused_reading_show_nothing():
     state, applied = Reading(keys=("state",)), Reading(keys=("applied",))
     system = RealSystem(guarded, PENDULUM, state=state, exogenous=(), applied=applied)
     found = check_real_system(system, PENDULUM)
-    assert found.sound and (found.present.unexplained < 1e-12).all()
+    assert not found.mistakes and (found.present.unexplained < 1e-12).all()
 
 
 def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():

@@ -4,13 +4,13 @@ import asyncio
 import contextlib
 import re
 import struct
-import threading
 from functools import partial
 
 import pytest
 import torch
+from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
-from served_plants import free_port
+from served_plants import free_port, in_a_thread
 from test_real_flights import HORIZON, algorithm
 from test_real_system import connected
 from test_safety import Clock, Failing, failing, fly, layer
@@ -30,11 +30,11 @@ HELD = {"double": 0.0, "float": 0.0, "whole": 0, "switch": False, "text": "off",
 class Controls:
     """An OPC UA server in a thread of the test, whose nodes the test reads and marks."""
 
-    def __init__(self, ua, server, nodes, loop, url):
-        self.ua, self.nodes, self.url, self._server, self._loop = ua, nodes, url, server, loop
+    def __init__(self, ua, server, nodes, url):
+        self.ua, self.nodes, self.url, self._server = ua, nodes, url, server
 
     def _now(self, work):
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(10.0)
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(10.0)
 
     def held(self, tag):
         return self._now(self.nodes[tag].read_value())
@@ -51,42 +51,28 @@ class Controls:
         return OpcUaLink(client, *names, timeout=timeout)
 
 
-@contextlib.contextmanager
-def controls():
+@contextlib.asynccontextmanager
+async def controls():
     asyncua = pytest.importorskip("asyncua")
-    ua, started, found = asyncua.ua, threading.Event(), {}
+    ua, server, nodes = asyncua.ua, asyncua.Server(), {}
     kinds = {"float": ua.VariantType.Float, "whole": ua.VariantType.Int16}
-
-    async def serve():
-        server, ended = asyncua.Server(), asyncio.Event()
-        await server.init()
-        server.set_endpoint(url := f"opc.tcp://127.0.0.1:{free_port()}")
-        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-        await server.register_namespace("urn:test")
-        nodes = {}
-        for tag, value in (HELD | {"position": 0.5, "velocity": -0.25}).items():
-            identifier = ua.NodeId.from_string(f"ns=2;s={tag}")
-            nodes[tag] = await server.nodes.objects.add_variable(identifier, tag, value, kinds.get(tag))
-            if tag in HELD and tag != "fixed":
-                await nodes[tag].set_writable()
-        async with server:
-            found.update(controls=Controls(ua, server, nodes, asyncio.get_running_loop(), url), end=ended)
-            started.set()
-            await ended.wait()
-
-    work = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
-    work.start()
-    assert started.wait(30.0)
-    try:
-        yield found["controls"]
-    finally:
-        found["controls"]._loop.call_soon_threadsafe(found["end"].set)
-        work.join(30.0)
+    await server.init()
+    server.set_endpoint(url := f"opc.tcp://127.0.0.1:{free_port()}")
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    await server.register_namespace("urn:test")
+    for tag, value in (HELD | {"position": 0.5, "velocity": -0.25}).items():
+        identifier = ua.NodeId.from_string(f"ns=2;s={tag}")
+        nodes[tag] = await server.nodes.objects.add_variable(identifier, tag, value, kinds.get(tag))
+        if tag in HELD and tag != "fixed":
+            await nodes[tag].set_writable()
+    async with server:
+        yield Controls(ua, server, nodes, url)
 
 
 @pytest.fixture(scope="module")
 def server():
-    with controls() as found:
+    with in_a_thread(controls()) as (found, loop):
+        found.loop = loop
         yield found
 
 
@@ -257,80 +243,58 @@ def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_ne
     env.close()
 
 
-def modbus_server(addresses, inputs=None):
-    """A Modbus server; gives its port and the function that ends it.
-
-    Args:
-        addresses: first address and number of its holding registers, which hold zeros.
-        inputs: address and number of each input register; None for one table that holds all.
-    """
-    pytest.importorskip("pymodbus")
+@contextlib.asynccontextmanager
+async def registers(port, inputs):
+    """A Modbus server of eight holding registers, which hold zeros, and of input registers, by address and word."""
     from pymodbus import simulator
     from pymodbus.server import ModbusTcpServer
 
-    port, started, loops = free_port(), threading.Event(), []
+    def block(first, values, kind="REGISTERS"):
+        return simulator.SimData(first, values=values, datatype=simulator.DataType[kind])
 
-    async def serve():
-        registers = [
-            simulator.SimData(first, values=[0] * count, datatype=simulator.DataType.REGISTERS)
-            for first, count in addresses
-        ]
-        if inputs is not None:
-            bits = [simulator.SimData(0, values=False, datatype=simulator.DataType.BITS)]
-            words = [
-                simulator.SimData(first, values=word, datatype=simulator.DataType.REGISTERS) for first, word in inputs
-            ]
-            registers = (bits, bits, registers, words)
-        device = simulator.SimDevice(id=1, simdata=registers)
-        running = ModbusTcpServer(device, address=("127.0.0.1", port))
-        await running.serve_forever(background=True)
-        ended = asyncio.Event()
-        loops.append((asyncio.get_running_loop(), ended))
-        started.set()
-        await ended.wait()
+    blocks = [block(0, [0] * 8)]
+    if inputs:
+        bits = [block(0, False, "BITS")]
+        blocks = (bits, bits, blocks, [block(first, word) for first, word in inputs])
+    running = ModbusTcpServer(simulator.SimDevice(id=1, simdata=blocks), address=("127.0.0.1", port))
+    await running.serve_forever(background=True)
+    try:
+        yield
+    finally:
         await running.shutdown()
 
-    work = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
-    work.start()
-    assert started.wait(30.0)
 
-    def end():
-        loop, ended = loops[0]
-        loop.call_soon_threadsafe(ended.set)
-        work.join(30.0)
-
-    return port, end
-
-
-def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason():
-    port, end = modbus_server([(0, 8)])
-    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
-    link = ModbusLink(client, {"position": Register(0), "velocity": Register(4)}, {"torque": Register(1000)})
-    try:
+@contextlib.contextmanager
+def modbus(read, written, inputs=()):
+    """A link to a Modbus server, and its client, which are connected."""
+    package, port = pytest.importorskip("pymodbus.client"), free_port()
+    client = package.ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
+    with in_a_thread(registers(port, inputs)), contextlib.closing(ModbusLink(client, read, written)) as link:
         link.connect()
-        assert link.read() == {"position": 0.0, "velocity": 0.0}
-        with pytest.raises(RefusedRequestError, match=r"torque = 1.5.*registers 1000 to 1003.*illegal data address"):
+        yield link, client
+
+
+@pytest.mark.parametrize(
+    ("registers", "message"),
+    [
+        ({"written": {"torque": Register(1000)}}, "torque = 1.5.*registers 1000 to 1003.*illegal data address"),
+        ({"read": {"pressure": Register(40)}}, "pressure.*registers 40 to 43.*illegal data address"),
+    ],
+)
+def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason(registers, message):
+    given = {"read": {"position": Register(0)}, "written": {"torque": Register(0)}} | registers
+    with modbus(**given) as (link, client):
+        with pytest.raises(RefusedRequestError, match=message):
             link.write({"torque": 1.5})
-        assert link.read() == {"position": 0.0, "velocity": 0.0}  # the connection is still there
-        link.close()
-        beyond = ModbusLink(client, {"pressure": Register(40)}, {"torque": Register(0)})
-        beyond.connect()
-        with pytest.raises(RefusedRequestError, match=r"pressure.*registers 40 to 43.*illegal data address"):
-            beyond.read()
-        beyond.close()
-    finally:
-        end()
+            link.read()
+        assert client.connected
 
 
 def test_registers_have_a_type_a_scale_and_a_word_order():
     """Against the bytes of the standard: tenths, a float with its low word first, and a command in hundredths."""
-    port, end = modbus_server([(0, 8)])
-    package = pytest.importorskip("pymodbus.client")
-    client = package.ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
     tags = {"level": Register(0, "int16", scale=0.1), "flow": Register(1, "float32", word_order="little")}
-    link = ModbusLink(client, tags, {"valve": Register(4, "uint16", scale=0.01), "count": Register(5, "int16")})
-    try:
-        link.connect()
+    written = {"valve": Register(4, "uint16", scale=0.01), "count": Register(5, "int16")}
+    with modbus(tags, written) as (link, client):
         low, high = struct.unpack(">HH", struct.pack(">f", -2.5))[::-1]
         client.write_registers(0, [0xFFFF - 122, low, high], device_id=1)
         assert link.read() == {"level": pytest.approx(-12.3), "flow": -2.5}
@@ -339,27 +303,19 @@ def test_registers_have_a_type_a_scale_and_a_word_order():
         for values, tag in (({"valve": -0.5, "count": 0.0}, "valve"), ({"valve": 0.5, "count": 0.5}, "count")):
             with pytest.raises(RefusedRequestError, match=f"'{tag}' = {values[tag]:g} does not fit Register"):
                 link.write(values)
-    finally:
-        link.close()
-        end()
 
 
 def test_input_registers_are_read_in_one_request_of_their_own_table():
     """Function 4 of the standard, and not 3: the server holds other numbers in its holding registers."""
-    port, end = modbus_server([(0, 8)], inputs=[(10, 0xFFFF - 122), (11, 0x4048), (12, 0xF5C3)])
-    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", port=port, timeout=2.0, retries=0)
     tags = {"flow": Register(11, "float32", table="input"), "level": Register(10, "int16", scale=0.1, table="input")}
-    link, requests = ModbusLink(client, tags, {"valve": Register(0)}), []
-    client.read_input_registers = lambda first, read=client.read_input_registers, **options: (
-        requests.append((first, options["count"])) or read(first, **options)
-    )
-    try:
-        link.connect()
+    words = [(10, 0xFFFF - 122), (11, 0x4048), (12, 0xF5C3)]
+    with modbus(tags, {"valve": Register(0)}, words) as (link, client):
+        requests, read = [], client.read_input_registers
+        client.read_input_registers = lambda first, **options: (
+            requests.append((first, options["count"])) or read(first, **options)
+        )
         assert link.read() == {"flow": pytest.approx(3.14, rel=1e-7), "level": pytest.approx(-12.3)}
         assert requests == [(10, 3)]
-    finally:
-        link.close()
-        end()
 
 
 def test_the_first_action_after_a_reset_moves_at_the_rate_from_what_the_machine_has_applied():
@@ -448,20 +404,13 @@ def test_a_reward_is_no_reading():
         algorithm(env).episode()
 
 
-class Silent(PlantEnv):
-    """A system that leaves out its observation from its third step on."""
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        return found.exclude("observation") if self._step_count >= 3 else found
-
-
 def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
-    env = layer(Silent(LinearQuadratic(horizon=HORIZON)))
+    plant, dropped = LinearQuadratic(horizon=HORIZON), Injection("dropped", 2, 19, episode=0)
+    env = layer(FaultySystem(PlantEnv(plant), [dropped], interval=plant.dt))
     episode = fly(env, [0.5] * 20)
     assert episode["next", "refused"].flatten().nonzero().flatten().tolist() == list(range(2, 20))
-    assert (episode["next", "observation"][0, 2:] == episode["next", "observation"][0, 1]).all()
-    assert env.report.counts["missing"] == 18 and "observation" in env.report.events[0].reasons["missing"]
+    assert (episode["next", "state"][0, 2:] == episode["next", "state"][0, 1]).all()
+    assert env.report.counts["missing"] == 18 and "state" in env.report.events[0].reasons["missing"]
 
 
 def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():

@@ -30,9 +30,8 @@ from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.start import Start
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operation.operator import FIRST, Crew, Operation
+from rt_torchrl.systems.operation.operator import FIRST, Crew, Operation, SimulatedOperation
 from rt_torchrl.systems.operation.process import ProcessOperation
-from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback

@@ -352,7 +352,7 @@ class Run:
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
         record |= results.twin_entries(self.algorithm.twin)
         if self.algorithm.flights.faults:
-            record["faults"] = [fault.entry() for fault in self.algorithm.flights.faults]
+            record["faults"] = [fault._asdict() for fault in self.algorithm.flights.faults]
             for fault in self.algorithm.flights.faults:
                 bar.write(f"episode {record['episode'] + 1}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         every = self.config.unseen_every

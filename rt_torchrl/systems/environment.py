@@ -310,6 +310,13 @@ class AroundSystem(EnvBase):
             self.env.begin_window()
         self._count_window()
 
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """State of the system; what stands around it has none that outlives an episode."""
+        return self.env.state_dict(*args, **kwargs)
+
+    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        self.env.load_state_dict(state, *args, **kwargs)
+
     def close(self, **kwargs: Any) -> None:
         """Close the system too, such as its connection or its window."""
         self.env.close(**kwargs)

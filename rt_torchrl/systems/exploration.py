@@ -67,17 +67,12 @@ class LivePolicy(nn.Module):
         self._noise: Tensor | None = None
         self._scale = 0.5 * config.spread * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
-        self._generator, self._plant = generator, (plant,)
+        self.generator, self._plant = generator, (plant,)
 
     @property
     def plant(self) -> Plant:
         """Plant that gives the ranges of the actions and the control interval."""
         return self._plant[0]
-
-    @property
-    def generator(self) -> torch.Generator:
-        """Source of the noise."""
-        return self._generator
 
     def begin(self, policy: nn.Module, *, strength: float) -> None:
         """Start an episode with the policy that is live now and ξ = ``strength``; state feedback gets ready for it."""
@@ -89,7 +84,7 @@ class LivePolicy(nn.Module):
         """The noise of the next control interval; where ξ is zero, it is zero and nothing is drawn."""
         if self.strength == 0.0:
             return torch.zeros(shape, dtype=torch.float64, device=self.low.device)
-        fresh = torch.randn(shape, generator=self._generator, dtype=torch.float64, device=self.low.device)
+        fresh = torch.randn(shape, generator=self.generator, dtype=torch.float64, device=self.low.device)
         if self._noise is None:
             self._noise = fresh
         else:
@@ -197,9 +192,8 @@ class BumplessPolicy(LivePolicy):
         return command if self._offset is None else command + self._offset
 
     def _faded(self, offset: Tensor, state: Tensor) -> Tensor | None:
-        (plant,) = self._plant
-        full = plant.at_rest(state)
-        ends = [plant.actuate(full, end.expand_as(offset)) for end in (self.low, self.high)]
+        full = self.plant.at_rest(state)
+        ends = [self.plant.actuate(full, end.expand_as(offset)) for end in (self.low, self.high)]
         step = torch.minimum(self._share, 0.5 * (ends[1] - ends[0]).abs())
         left = offset.sign() * (offset.abs() - step).clamp(min=0.0)
         return left if left.any() else None

@@ -120,11 +120,6 @@ class Wiring(NamedTuple):
     moved: Float[Tensor, " n_s"]
     mistakes: tuple[Suspicion, ...]
 
-    @property
-    def sound(self) -> bool:
-        """Whether no mistake fits better than the wiring as it is."""
-        return not self.mistakes
-
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
         signals = zip(self.plant.states, self.moved.tolist(), *self.present[1:], strict=True)

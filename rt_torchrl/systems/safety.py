@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from rt_torchrl.atomic_file import finite
 from rt_torchrl.options import array_of, require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -52,13 +53,6 @@ class SafetyEvent(NamedTuple):
     asked: list[float]
     applied: list[float]
     at: float  # end of the interval on this machine's clock, counted from 1970 [s]
-
-    def line(self) -> str:
-        """The event as one line of JSON, with null for every number that is not finite."""
-        entry = self._asdict()
-        for key in ("asked", "applied"):
-            entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
-        return json.dumps(entry)
 
 
 @dataclass
@@ -457,20 +451,13 @@ class SafetyLayer(AroundSystem):
         if self.config.log is not None and self._unwritten is None:
             try:
                 with self.config.log.open("a", encoding="utf-8") as file:
-                    file.write(event.line() + "\n")
+                    file.write(json.dumps(finite(event._asdict())) + "\n")
             except OSError as error:
                 # A full disk must not stop the control of a machine that moves.
                 self._unwritten = error
 
     def _flag(self, value: bool) -> Tensor:
         return torch.full((*self.batch_size, 1), value, dtype=torch.bool, device=self.device)
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """State of the system; the layer itself has none that outlives an episode."""
-        return self.env.state_dict(*args, **kwargs)
-
-    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        self.env.load_state_dict(state, *args, **kwargs)
 
 
 def layer_of(env: EnvBase) -> SafetyLayer | None:

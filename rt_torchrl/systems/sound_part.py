@@ -4,7 +4,7 @@ What is not finite is refused on the way to a learner.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,10 +36,6 @@ class Fault(NamedTuple):
     interval: int
     time: float  # start of the interval, counted from the start of the episode [s]
     detail: str
-
-    def entry(self) -> dict[str, Any]:
-        """The fault in an episode's record."""
-        return self._asdict()
 
 
 class EpisodeEndedError(ValueError):

@@ -156,6 +156,8 @@ class ConnectedPlant(EnvBase):
         self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
         self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
         self._patience, self._clock, self._sleep = patience, clock, sleep
+        self.reads_applied = "applied" in entries
+        """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
         self.losses = self.late = self.stale = self.skipped = 0
         self._in_a_row = self._gap = 0
         self._sample, self._connected, self._closing = -math.inf, False, False
@@ -170,11 +172,6 @@ class ConnectedPlant(EnvBase):
         low, high = bounds(tuple(actions))
         self.action_spec = Bounded(low, high, (len(actions),), **double)
         self.reward_spec = Unbounded((1,), **double)
-
-    @property
-    def reads_applied(self) -> bool:
-        """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
-        return "applied" in self._entries_of
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing, because a machine takes no seed."""

@@ -330,11 +330,6 @@ class ServerProcess:
             raise ValueError(f"the plant server does not start on port={self._port}; another program may have it.")
         return self
 
-    @property
-    def pid(self) -> int:
-        """Number of the server's process."""
-        return int(self._process.pid)
-
     def __exit__(self, *raised: object) -> None:
         self._ended.set()
         end_process(self._process, END)

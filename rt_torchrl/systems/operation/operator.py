@@ -105,11 +105,6 @@ class Operation(ABC):
         closure: nn.Module | None = self.system.closure
         return closure
 
-    @property
-    def begun(self) -> bool:
-        """Whether a policy has been handed over yet."""
-        return self.version >= 0
-
     def hand_over(
         self, name: str, policy: nn.Module, *, strength: float, found: dict[str, float | str] | None = None
     ) -> None:
@@ -280,7 +275,7 @@ class Operator:
         self.env, self.actor, self.policies = env, actor, policies
         self.continuous, self._own_pace = continuous, pace
         self.pace: Pace | None = getattr(env, "pace", None) if pace is None else pace
-        self.interval, self.windows, self._failed_resets = 0, 0, 0
+        self.interval, self._failed_resets = 0, 0
         self._order: Order | None = None
         self._begun = False
         self._window: TensorDict | None = None
@@ -351,17 +346,7 @@ class Operator:
         if k + 1 < self.length:
             early = row["next", "done"].any()
             return self._ended(k + 1, str(ended_early(row["next"], k + 1, self.actor.plant))) if early else None
-        self.windows += 1
         return Window(self._window, report=report_of(self.env), acted=self._acted())
-
-    def fly(self, orders: dict[int, list[Order]]) -> Window:
-        """One window, at whose intervals the orders come, by number of the interval since the operation began."""
-        window = None
-        while window is None:
-            for order in orders.get(self.interval, ()):
-                self.follow(order)
-            window = self.step()
-        return window
 
     def _begin(self) -> None:
         """Begin a window."""
@@ -390,8 +375,7 @@ class Operator:
     def _ended(self, count: int, why: str) -> Window:
         """The window of which ``count`` intervals were acted in; the next one begins with a reset."""
         entries = None if self._window is None or not count else self._window[:, :count].clone()
-        self.windows += 1
-        self.interval, self._begun = self.windows * self.length, False
+        self.interval, self._begun = (self.interval // self.length + 1) * self.length, False
         return Window(entries, why, report_of(self.env) if count else None, self._acted() if count else None)
 
     def _acted(self) -> dict[str, float] | None:
@@ -431,7 +415,7 @@ class Operator:
         """
         self.env.load_state_dict(state["env"])
         self.actor.generator.set_state(state["generator"].cpu())
-        self.interval, self.windows = state["interval"], state["interval"] // self.length
+        self.interval = state["interval"]
         self._order, self._begun, self._row = None, False, None
         if state["order"] is not None:
             self.follow(Order(**state["order"]))
@@ -479,3 +463,59 @@ class Crew:
         paced = self.config.clock == "wall" and getattr(env, "pace", None) is None
         pace = Pace(self.plant.dt / self.config.speed) if paced else None
         return Operator(env, actor, self.policies, continuous=self.config.continuous, pace=pace)
+
+
+class SimulatedOperation(Operation):
+    """An operation in the process of the learner; see :class:`Operation` for the methods.
+
+    Time is counted in control intervals. The learner learns from a window when it is complete, which takes ``learning``
+    intervals; its policy then takes over, in the middle of a window. Windows that are completed while it learns are
+    taken together. A window is computed when the learner takes it, and not before, so that a checkpoint after an
+    episode never falls within a window.
+
+    Args:
+        operator: what acts.
+        learning: time from taking a window to handing the next policy over, in control intervals.
+        log: file of the events.
+
+    Raises:
+        ValueError: if ``learning`` is negative.
+    """
+
+    def __init__(self, operator: Operator, *, learning: int, log: Path | None = None):
+        if learning < 0:
+            raise ValueError(f"learning={learning} control intervals must not be negative.")
+        super().__init__(operator.env, log)
+        self.operator, self._learning = operator, learning
+        self._coming: dict[int, int] = {}  # interval in which each version takes over
+        self._now = 0
+
+    def _pass_on(self, order: Order) -> None:
+        if self.version >= 0:
+            self._now += self._learning
+        self._coming[order.version] = self._now
+
+    def waiting(self) -> bool:
+        return self.operator.interval + self.operator.length <= self._now
+
+    def rollout(self) -> TensorDict:
+        window = None
+        while window is None:
+            for version in [version for version, at in self._coming.items() if at <= self.operator.interval]:
+                del self._coming[version]
+                self.operator.follow(self.orders[version])
+            window = self.operator.step()
+        self._now = max(self._now, self.operator.interval)
+        return self._take(window, self.operator.version)
+
+    def close(self) -> None:
+        """Do nothing, because the system stands still between two windows."""
+
+    def state_dict(self) -> dict[str, Any]:
+        parts = {"operator": self.operator.state_dict(), "coming": list(self._coming.items()), "now": self._now}
+        return super().state_dict() | parts
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.operator.load_state_dict(state["operator"])
+        self._coming, self._now = dict(state["coming"]), state["now"]

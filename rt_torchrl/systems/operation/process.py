@@ -60,11 +60,6 @@ class ProcessOperation(Operation):
         self._connection: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
 
-    @property
-    def pid(self) -> int | None:
-        """Number of the acting process; None while there is none."""
-        return None if self._process is None else self._process.pid
-
     def _pass_on(self, order: Order) -> None:
         connection = self._begun()
         try:
