@@ -73,11 +73,12 @@ def flight(plant, steps=40, batch=2):
 
 
 def zero_order_hold(A, b, u, x):
-    """The state after DT of ẋ = A x + b u."""
+    """The state after DT of ẋ = A x + b u, and its mean over DT."""
     n = len(x)
-    joint = torch.zeros(n + 1, n + 1, dtype=torch.float64)
-    joint[:n, :n], joint[:n, n] = A, b
-    return torch.as_tensor(expm((joint * DT).numpy()))[:n] @ torch.cat([x, u.reshape(1)])
+    joint = torch.zeros(2 * n + 1, 2 * n + 1, dtype=torch.float64)
+    joint[:n, :n], joint[:n, -1], joint[n:-1, :n] = A, b, torch.eye(n)
+    found = torch.as_tensor(expm((joint * DT).numpy())) @ torch.cat([x, torch.zeros(n), u.reshape(1)])
+    return found[:n], found[n:-1] / DT
 
 
 @pytest.mark.parametrize("name", EXTENSIONS)
@@ -103,11 +104,6 @@ def test_gradients_by_closure_and_policy_are_those_of_backpropagation(name):
     assert all(gradient.any() for gradient in reference)
 
 
-def hidden_of(plant):
-    state, exogenous, command = flight(plant)
-    return Rollout(plant, plant.closure)(state, exogenous, command).states[0, :, 2:], command[0, :, 0]
-
-
 @pytest.mark.parametrize(
     "name, A, b",
     [
@@ -115,13 +111,15 @@ def hidden_of(plant):
         ("resonance", [[0.0, 1.0], [-9.0, -2.4]], [0.0, 9.0]),
     ],
 )
-def test_hidden_states_follow_the_matrix_exponential(name, A, b):
-    hidden, command = hidden_of(EXTENSIONS[name](LinearQuadratic()))
+def test_an_actuator_follows_the_matrix_exponential_and_its_mean_acts(name, A, b):
+    plant = EXTENSIONS[name](LinearQuadratic())
     A, b = torch.tensor(A, dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
-    expected = [hidden[0]]
-    for u in command:
-        expected.append(zero_order_hold(A, b, u, expected[-1]))
-    torch.testing.assert_close(hidden, torch.stack(expected), rtol=1e-12, atol=1e-12)
+    hidden = torch.linspace(-0.3, 0.4, len(b)).double()
+    for u in flight(plant)[2][0]:
+        end, mean = zero_order_hold(A, b, u, hidden)
+        acting, hidden = plant.respond(hidden, u, plant.closure)
+        torch.testing.assert_close(hidden, end, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(acting, mean[:1], rtol=1e-12, atol=1e-12)
 
 
 def test_a_delay_gives_what_was_asked_for_earlier():

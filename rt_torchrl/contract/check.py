@@ -147,7 +147,7 @@ def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: 
     except Exception as error:
         plant, trace = subject.plant if isinstance(subject, Calls) else subject, inspect.trace()
         own = [k for k, x in enumerate(trace) if x.frame.f_locals.get("self") is plant and hasattr(plant, x.function)]
-        method = trace[own[-1]].function if own else name or trace[-1].function
+        method = name or trace[own[-1] if own else -1].function
         inside = trace[own[-1] if own else 0 :]
         theirs = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
         place = (theirs or inside)[-1]
