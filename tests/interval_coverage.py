@@ -33,11 +33,13 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.resampling import filled, initial_spread, logged_readings, resample
-from rt_torchrl.fit.uncertainty import Band, band, named_values
+from rt_torchrl.fit.uncertainty import band, named_values
 from rt_torchrl.plants.signal import bounds
 
 Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
 """Flies the episodes whose records are one simulation, of a plant with a closure."""
+Simulated = tuple[list[SensorRecord], Tensor | None]
+"""Records of one simulation, and the spread of their first states; None if nothing is known of these."""
 POINTS = 200
 """Number of visited points, or a few more, at which bands are compared with the true curve."""
 HELD = 20
@@ -48,14 +50,12 @@ class Coverage(NamedTuple):
     """Result over all simulations, for each named value of the closure.
 
     Args:
-        names: names of the values.
         inside: share of the simulations in which the 95 % interval holds the truth, of those with an interval.
         inside_68: the same for the 68 % interval, which is one standard error wide on each side.
         told: share of the simulations in which the data tell the value, so that it has an interval.
         error_over_bound: RMS error over the RMS standard error, which is the Cramér-Rao bound.
     """
 
-    names: list[str]
     inside: Tensor
     inside_68: Tensor
     told: Tensor
@@ -67,18 +67,21 @@ class Coverage(NamedTuple):
         return ((self.inside * self.told).nansum() / self.told.sum()).item()
 
 
+def values_of(closure: nn.Module) -> Tensor:
+    """The named values of a closure."""
+    return torch.stack(list(named_values(closure).values())).detach()
+
+
 def coverage(
     plant: Plant,
     closure: nn.Module,
     sensors: Sequence[Sensor],
+    simulated: Callable[[], Simulated],
     *,
-    simulations: int = 200,
-    share: float = 0.01,
-    generator: torch.Generator,
+    simulations: int,
     config: EstimationConfig | None = None,
-    flights: Flights | None = None,
 ) -> Coverage:
-    """Simulate records under the closure, add noise, estimate, and compare with the closure.
+    """Estimate from simulated records with noise, and compare with the closure of the simulated system.
 
     Every estimation begins with the true weights, because this is about intervals and not about local minima.
 
@@ -86,38 +89,41 @@ def coverage(
         plant: the plant.
         closure: closure of the simulated system, which the twin can represent exactly.
         sensors: sensors; their noise levels are estimated.
-        simulations: number of simulated records.
-        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
-        generator: source of initial states, inputs, commands and noise.
+        simulated: makes the records of one simulation, see :func:`recorded` and :func:`logged`.
+        simulations: number of simulations.
         config: parameters of the estimation.
-        flights: episodes of one simulation; by default one under random commands.
-
-    Raises:
-        ValueError: if there is no simulation, or the noise is no positive share.
     """
-    if simulations < 1 or not 0.0 < share < 1.0:
-        raise ValueError(f"simulations={simulations} must be at least 1, and the share={share} of the noise in (0, 1).")
-    truth = torch.stack(list(named_values(closure).values())).detach()
-    errors, bounds_found = [], []
-    twin = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True))
-    start = copy.deepcopy(twin.closure.state_dict())
+    twin, errors, scatter = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True)), [], []
     for _ in range(simulations):
-        flown = fly(plant, closure, generator, flights)
-        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
-        twin.closure.load_state_dict(start)
-        found = Estimation(twin, sensors, config=config).run(records)
-        errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
-        bounds_found.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
-    return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(bounds_found))
-
-
-def _counted(names: list[str], errors: Tensor, scatter: Tensor) -> Coverage:
-    z, known = errors / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
+        records, spread = simulated()
+        twin.closure.load_state_dict(closure.state_dict())
+        found = Estimation(twin, sensors, spread=spread, config=config).run(records)
+        errors.append(values_of(twin.closure) - values_of(closure))
+        scatter.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
+    z, bound = torch.stack(errors) / torch.stack(scatter), torch.stack(scatter)
+    known = bound.isfinite() & (bound > 0.0)  # without scatter it is a constant
     inside, inside_68 = (
         torch.where(known, (z.abs() <= width).double(), torch.nan).nanmean(0) for width in (1.959964, 0.994458)
     )
     ratio = torch.where(known, z, torch.nan).square().nanmean(0).sqrt()
-    return Coverage(names, inside, inside_68, known.double().mean(0), ratio)
+    return Coverage(inside, inside_68, known.double().mean(0), ratio)
+
+
+def recorded(
+    plant: Plant,
+    closure: nn.Module,
+    sensors: Sequence[Sensor],
+    generator: torch.Generator,
+    *,
+    share: float = 0.01,
+    flights: Flights | None = None,
+) -> Simulated:
+    """Noisy records of an episode under random commands, or of other flights; nothing is said of their first states.
+
+    ``share`` is the standard deviation of the noise over the RMS deviation of a sensor's readings from their mean.
+    """
+    flown = (flights or random_flights)(plant, closure, generator)
+    return with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator), None
 
 
 class Logging(NamedTuple):
@@ -127,25 +133,23 @@ class Logging(NamedTuple):
         every: number of control intervals between two rows, of which commands are held for a multiple.
         dropped: share of the rows that hold a value that is missing, and are left out.
         missing: share of the samples that single sensors lack.
-        noise: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
     """
 
     every: int = 1
     dropped: float = 0.0
     missing: float = 0.0
-    noise: float = 0.01
 
 
-def log_of(
-    plant: Plant, flown: Trajectory, sensors: Sequence[Sensor], logging: Logging, generator: torch.Generator
-) -> SensorLog:
-    """The log of a flight, whose rows hold noisy readings, commands and inputs."""
-    (record,) = with_noise([sensor_record(plant, sensors, flown)], logging.noise, generator)
+def logged(
+    plant: Plant, closure: nn.Module, sensors: Sequence[Sensor], generator: torch.Generator, logging: Logging
+) -> Simulated:
+    """The records that ``identify.py`` makes of the log of an episode, and the spread of their first states."""
+    flown = random_flight(plant, closure, generator)
+    (record,) = with_noise([sensor_record(plant, sensors, flown)], 0.01, generator)
     rows = slice(0, None, logging.every)
     held = [torch.cat([values, values[-1:]])[rows] for values in (flown.actions, flown.exogenous)]
     readings = record.readings[rows].clone()
-    lacking = torch.rand(readings.shape, generator=generator, dtype=torch.float64) < logging.missing
-    readings[lacking] = torch.nan
+    readings[torch.rand(readings.shape, generator=generator, dtype=torch.float64) < logging.missing] = torch.nan
     bad = torch.rand(len(readings), generator=generator, dtype=torch.float64) < logging.dropped
     bad[[0, -1]] = False
     signals = (*plant.actions, *plant.acting_inputs)
@@ -153,96 +157,14 @@ def log_of(
     columns[plant.actions[0].name] = np.where(bad.numpy(), np.nan, columns[plant.actions[0].name])
     columns |= {sensor.name: values.numpy() for sensor, values in zip(sensors, readings.T, strict=True)}
     log = SensorLog(times=plant.dt * logging.every * np.arange(len(readings)), columns=columns)
-    return checked(log, plant, drop=True, missing=True)
-
-
-def logged_coverage(
-    plant: Plant,
-    closure: nn.Module,
-    sensors: Sequence[Sensor],
-    logging: Logging,
-    *,
-    simulations: int,
-    generator: torch.Generator,
-    config: EstimationConfig,
-) -> Coverage:
-    """As :func:`coverage`, from a log, as ``recipes/identify.py`` reads it."""
-    truth = torch.stack(list(named_values(closure).values())).detach()
-    twin, errors, scatter = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True)), [], []
-    start = copy.deepcopy(twin.closure.state_dict())
-    for _ in range(simulations):
-        flown = random_flight(plant, closure, generator)
-        log = log_of(plant, flown, sensors, logging, generator)
-        parts = resample(filled(log, plant), plant)
-        records = [logged_readings(log, plant, tuple(sensors), part, parts.gap) for part in parts.segments]
-        twin.closure.load_state_dict(start)
-        found = Estimation(twin, sensors, spread=initial_spread(plant, log), config=config).run(records)
-        errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
-        scatter.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
-    return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(scatter))
-
-
-def curve_coverage(
-    plant: Plant,
-    start: Callable[[torch.Generator], nn.Module],
-    sensors: Sequence[Sensor],
-    visited: Callable[[Plant, Trajectory], Tensor],
-    *,
-    output: int = 0,
-    simulations: int = 50,
-    share: float = 0.01,
-    generator: torch.Generator,
-    config: EstimationConfig | None = None,
-    flights: Flights | None = None,
-) -> Tensor:
-    """How often the bands of a neural closure hold the true curve, where the system has been.
-
-    Args:
-        plant: the plant, with its true closure.
-        start: draws the closure that an estimation begins with.
-        sensors: sensors; their noise levels are estimated.
-        visited: features on which the plant calls its closure along a trajectory, in the last dimension.
-        output: number of the closure's output.
-        simulations: number of simulations.
-        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
-        generator: source of first closures, initial states, inputs, commands and noise.
-        config: parameters of the estimation, with the prior of the closure's perceptrons.
-        flights: episodes of one simulation; by default one under random commands.
-
-    Returns:
-        Share of the visited points at which the 95 % interval holds the true curve, in each simulation.
-    """
-    found = []
-    for _ in range(simulations):
-        flown = fly(plant, plant.closure, generator, flights)
-        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
-        estimate = Estimation(DigitalTwin(plant, start(generator)), sensors, config=config).run(records)
-        every = torch.cat([visited(plant, one).flatten(0, -2) for one in flown])
-        points = every[:: max(1, len(every) // POINTS)]
-        seen = band(estimate.uncertainty, torch.arange(len(points)).double(), points, output=output)
-        with torch.no_grad():
-            found.append(covered(seen, plant.closure(points)[:, output]))
-    return torch.tensor(found, dtype=torch.float64)
-
-
-def covered(drawn: Band, true: Tensor) -> float:
-    """Share of the points at which the interval holds the true curve."""
-    return ((true >= drawn.low) & (true <= drawn.high)).double().mean().item()
-
-
-def fly(plant: Plant, closure: nn.Module, generator: torch.Generator, flights: Flights | None) -> list[Trajectory]:
-    """Episodes of one simulation; by default one under random commands."""
-    return [random_flight(plant, closure, generator)] if flights is None else flights(plant, closure, generator)
+    log = checked(log, plant, drop=True, missing=True)
+    parts = resample(filled(log, plant), plant)
+    records = [logged_readings(log, plant, tuple(sensors), part, parts.gap) for part in parts.segments]
+    return records, initial_spread(plant, log)
 
 
 def with_noise(records: Sequence[SensorRecord], share: float, generator: torch.Generator) -> list[SensorRecord]:
-    """Records with white noise, whose guesses of the first states stay the true ones.
-
-    Args:
-        records: the records.
-        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
-        generator: source of the noise.
-    """
+    """Records with white noise, whose guesses of the first states stay the true ones; see :func:`recorded`."""
     readings = torch.cat([record.readings for record in records])
     scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
     found = []
@@ -269,6 +191,11 @@ def random_flight(
     drawn = torch.rand(1, -(-plant.n_steps // HELD), len(least), generator=generator, dtype=torch.float64)
     share = low + (high - low) * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
     return Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]
+
+
+def random_flights(plant: Plant, closure: nn.Module, generator: torch.Generator) -> list[Trajectory]:
+    """One episode under random commands."""
+    return [random_flight(plant, closure, generator)]
 
 
 class Case(NamedTuple):
@@ -331,7 +258,6 @@ class CurveCase(NamedTuple):
     start: Callable[[torch.Generator], nn.Module]
     sensors: tuple[str, ...]
     prior: float
-    curve: str
     flights: Flights | None = None
 
 
@@ -377,7 +303,6 @@ CURVES: dict[str, CurveCase] = {
         lambda g: NeuralPowerCoefficient(SaintDrenan.from_set("BestFitToROSCOTable"), hidden=HIDDEN, generator=g),
         ("rotor_speed",),
         0.1,
-        "C_p",
         turbine_flights,
     ),
     "flapping_wing": CurveCase(
@@ -385,30 +310,29 @@ CURVES: dict[str, CurveCase] = {
         lambda g: NeuralPolar(QuasiSteadyPolar.draw(g, spread=0.1), hidden=HIDDEN, generator=g),
         ("forward_position", "height", "forward_speed", "climb_speed"),
         3.0,
-        "C_L",
     ),
     "cascaded_tanks": CurveCase(
         lambda: CascadedTanks(closure=Bent(Hydraulics.true(), wavy_outlet)),
         lambda g: NeuralHydraulics(Hydraulics.true().requires_grad_(True), hidden=HIDDEN, generator=g),
         ("upper_level", "lower_level"),
         3.0,
-        "the upper tank's rate",
     ),
 }
 """The simulations of curves, by the plant's name; each prior lets the weights of a perceptron be of order one."""
 
 
-def curves_of(case: CurveCase, simulations: int, noise: float, seed: int) -> Tensor:
-    """Share of the visited points whose band holds the true curve, in each simulation."""
-    plant = case.plant()
-    return curve_coverage(
-        plant,
-        case.start,
-        sensors_of(plant, case.sensors),
-        visited_features,
-        simulations=simulations,
-        share=noise,
-        generator=torch.Generator().manual_seed(seed),
-        config=EstimationConfig(iterations=60, rounds=4, prior=case.prior),
-        flights=case.flights,
-    )
+def curves_of(case: CurveCase, simulations: int) -> Tensor:
+    """Share of the points where the system has been at which the 95 % band holds the true curve, in each simulation."""
+    plant, generator, found = case.plant(), torch.Generator().manual_seed(0), []
+    sensors, config = sensors_of(plant, case.sensors), EstimationConfig(iterations=60, rounds=4, prior=case.prior)
+    for _ in range(simulations):
+        flown = (case.flights or random_flights)(plant, plant.closure, generator)
+        records = with_noise([sensor_record(plant, sensors, one) for one in flown], 0.01, generator)
+        estimate = Estimation(DigitalTwin(plant, case.start(generator)), sensors, config=config).run(records)
+        every = torch.cat([visited_features(plant, one).flatten(0, -2) for one in flown])
+        points = every[:: max(1, len(every) // POINTS)]
+        drawn = band(estimate.uncertainty, torch.arange(len(points)).double(), points)
+        with torch.no_grad():
+            true = plant.closure(points)[:, 0]
+        found.append(((true >= drawn.low) & (true <= drawn.high)).double().mean())
+    return torch.stack(found)

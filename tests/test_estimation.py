@@ -12,7 +12,7 @@ from test_uncertainty import position
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
+from rt_torchrl.fit.least_squares import Estimation, judged
 from rt_torchrl.fit.sensors import (
     Sensor,
     known_sensors,
@@ -24,8 +24,6 @@ from rt_torchrl.fit.sensors import (
 )
 from rt_torchrl.plants.signal import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
-
-FAST = EstimationConfig(iterations=30)
 
 
 def test_derivatives_are_those_of_backpropagation():
@@ -77,21 +75,22 @@ def test_a_line_with_holes_is_fitted_as_by_regression():
     level = math.sqrt(residual[0] / (80 - 4))
     errors = level * np.sqrt(np.diag(np.linalg.inv(X[kept].T @ X[kept])))
     closure = Slope()
-    found = Estimation(DigitalTwin(Line(), closure), sensors, config=FAST).run(records)
+    found = Estimation(DigitalTwin(Line(), closure), sensors).run(records)
     # The descent ends where J can fall by 1e-8 of it; the noise level rests within one per cent.
     np.testing.assert_allclose(list(found.after.values()), solution[2:], atol=1e-3 * errors[2:].min())
     np.testing.assert_allclose(found.initial[:, 0].numpy(), solution[:2], atol=1e-3 * errors[:2].min())
     assert found.noise["position"] == pytest.approx(level, rel=0.01)
+    assert judged(found.likelihood).rms.item() == pytest.approx(math.sqrt(residual[0] / 80), rel=1e-6)
     np.testing.assert_allclose(list(found.uncertainty.standard_errors().values()), errors[2:], rtol=0.01)
     np.testing.assert_allclose(found.uncertainty.initial_errors()[:, 0].numpy(), errors[:2], rtol=0.01)
 
 
 def test_a_bias_is_told_from_the_state():
     """Two sensors of one position, one of which is off by a constant: the difference of their means."""
-    plant, values = Line(), 1.0 + 0.05 * np.arange(50)
-    sensors = (*sensors_of(plant, ["position"]), Sensor(measurement=sensors_of(plant, ["position"])[0].measurement))
-    sensors = (sensors[0], Sensor(measurement=sensors[1].measurement, noise=0.1, bias=True))
-    record = sensor_record(plant, sensors, line_segment(values))
+    plant = Line()
+    (sensor,) = sensors_of(plant, ["position"])
+    sensors = sensor, Sensor(measurement=sensor.measurement, noise=0.1, bias=True)
+    record = sensor_record(plant, sensors, line_segment(1.0 + 0.05 * np.arange(50)))
     noise = torch.stack([0.1 * torch.from_numpy(noise_of(50, k)) for k in (0, 1)], -1)
     readings = record.readings + noise + torch.tensor([0.0, 0.7])
     found = Estimation(DigitalTwin(plant, Slope()), sensors).run([record._replace(readings=readings)])
@@ -104,7 +103,7 @@ def test_a_room_is_identified_through_its_air_with_its_uncertainty():
     plant, sensors, records = room_records()
     start = torch.tensor([30.0, 150.0, 8.0])
     closure = Envelope(start)
-    found = Estimation(DigitalTwin(plant, closure), sensors, config=FAST).run(records)
+    found = Estimation(DigitalTwin(plant, closure), sensors).run(records)
     errors = found.uncertainty.standard_errors()
     for name, true in zip(Envelope.names, Envelope.true_coefficients, strict=True):
         assert abs(found.after[name] - true) < 3.0 * errors[name] < 0.1 * true
@@ -112,7 +111,7 @@ def test_a_room_is_identified_through_its_air_with_its_uncertainty():
     assert ((found.initial[:, 1] - 14.5).abs() < 3.5).all() and not found.uncertainty.warnings()
     known = torch.zeros(2).double()
     guessed = Envelope(start)
-    Estimation(DigitalTwin(plant, guessed), sensors, spread=known, config=FAST).run(records)
+    Estimation(DigitalTwin(plant, guessed), sensors, spread=known).run(records)
     wrong = (guessed.coefficients - torch.tensor(Envelope.true_coefficients).double()).abs()
     assert wrong[1] > 10.0 * errors["outdoors"]
 
@@ -123,7 +122,7 @@ def test_what_one_sensor_cannot_tell_is_said():
     sensors = sensors_of(plant, ["position"])
     records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (50,))]
     records = [r._replace(readings=r.readings + 0.01 * torch.randn(51, 1, generator=generator)) for r in records]
-    found = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors, config=FAST).run(records)
+    found = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors).run(records)
     # The force enters ẍ with a known factor, so that the scale is known and only β is free.
     (message,) = (text for text in found.uncertainty.warnings() if "cannot tell" in text)
     assert "1 combination(s)" in message and "fix 1 of them" in message
@@ -172,10 +171,6 @@ def test_the_example_of_the_documentation_runs():
     true = plant.closure.named_coefficients()
     for name in ("lower_outlet", "lower_loss", "upper_outlet"):
         assert found.after[name] == pytest.approx(true[name].item(), rel=1e-3)
-
-
-N, LENGTH, PUSH = 60, 10, 0.5
-TIMES = 0.1 * np.arange(N + 1)
 
 
 def test_parts_of_a_record_share_no_sample():

@@ -1,14 +1,13 @@
 """Identification from a log: derivatives against backpropagation, fits against regression, recipes around logs."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_plants import Line, Slope, flown, line_segment, noise_of
+from small_plants import flown
 from test_export_recipe import recipe
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -60,27 +59,7 @@ def test_the_likelihood_of_the_states_with_the_noise_of_their_scales_is_the_cost
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
 
 
-def test_a_line_is_fitted_as_by_regression():
-    """Slope of two segments with a common w_0 and their own starts, against least squares by numpy."""
-    values = [2.0 + 0.5 * 0.1 * np.arange(n) + noise_of(n, n) for n in (60, 40)]
-    plant, sensors = Line(), sensors_of(Line(), ["position"])
-    records = [sensor_record(plant, sensors, line_segment(v)) for v in values]
-    found = identify(Estimation(DigitalTwin(plant, Slope()), sensors), records, records[1:])
-    X = np.zeros((100, 3))
-    X[:60, 0], X[60:, 1] = 1.0, 1.0
-    X[:, 2] = 0.1 * np.concatenate([np.arange(60), np.arange(40)])
-    solution, residual, *_ = np.linalg.lstsq(X, np.concatenate(values), rcond=None)
-    errors = found.estimate.uncertainty.standard_errors()
-    # The loop ends where J can fall by 1e-8 of it, which is 1e-4 standard errors or so.
-    assert abs(found.estimate.after["w[0]"] - solution[2]) < 1e-3 * errors["w[0]"]
-    assert found.training[1].rms.item() == pytest.approx(math.sqrt(residual[0] / 100), rel=1e-7)
-    # No wind blew: nothing is known of the second weight, and it stays.
-    assert math.isinf(errors["w[1]"]) and found.estimate.after["w[1]"] == found.estimate.before["w[1]"] == 0.3
-
-
-@pytest.fixture(scope="module")
-def identified():
-    """The oracle plant from a log with jitter, a gap and noise."""
+def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise():
     plant, generator = LinearQuadratic(dt=0.05, horizon=15.0, noise=0.5), torch.Generator().manual_seed(3)
     policy = plant.make_policy(generator)
     log = recorded(plant, policy_law(plant, policy), generator, jitter=0.4, noise=0.005)
@@ -88,13 +67,9 @@ def identified():
     parts = resample(log, plant)
     sensors = sensors_in(plant, log)
     split = hold_out(parts.segments, plant.dt, 0.25)
-    records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
+    training, held_out = ([logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split)
     task = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors, config=ROBUST)
-    return plant, parts, records, identify(task, *records)
-
-
-def test_the_oracle_plant_is_identified_from_a_jittered_log(identified):
-    plant, parts, (training, held_out), found = identified
+    found = identify(task, training, held_out)
     assert len(parts.gaps) == 1 and len(training) == 2 and len(held_out) == 1 and 0.1 < parts.jitter < 0.25
     true, errors = torch.tensor(plant.true_closure).flatten().tolist(), found.estimate.uncertainty.standard_errors()
     for (name, value), exact in zip(found.estimate.after.items(), true, strict=True):

@@ -39,21 +39,22 @@ class PricedEnd(LinearQuadratic):
         return self.price * state.square().sum(-1)
 
 
+def least_squares(plant, s_0, z, basis):
+    """Matrix and right side whose squares are the cost of an episode, by variables x of which ``basis`` x acts."""
+    A, B, D, Q, R = matrices(plant)
+    root, weight = np.linalg.cholesky(Q).T, np.sqrt(getattr(plant, "price", 0.0) / plant.dt)
+    gain, free, rows, rest = np.zeros((2, basis.shape[1])), s_0.copy(), [], []
+    for now, z_k in zip(basis, z, strict=True):
+        rows += [root @ gain, np.sqrt(R[0, 0]) * now[None]]
+        rest += [root @ free, np.zeros(1)]
+        gain, free = A @ gain + B * now, A @ free + D[:, 0] * z_k
+    return np.concatenate([*rows, weight * gain]), -np.concatenate([*rest, weight * free])
+
+
 def quadratic_program(plant, s_0, z):
     """The optimal actions of an episode as a bounded least-squares problem, and their J_a."""
-    A, B, D, Q, R = matrices(plant)
-    n, root = len(z), np.linalg.cholesky(Q).T
-    gain, free = np.zeros((2, n)), s_0.copy()
-    rows, rest = [], []
-    for k in range(n):
-        rows += [root @ gain, np.sqrt(R[0, 0]) * np.eye(n)[k : k + 1]]
-        rest += [root @ free, np.zeros(1)]
-        gain, free = A @ gain, A @ free + D[:, 0] * z[k]
-        gain[:, k] += B[:, 0]
-    weight = np.sqrt(getattr(plant, "price", 0.0) / plant.dt)
-    rows, rest = [*rows, weight * gain], [*rest, weight * free]
-    found = lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14)
-    return found.x, 2.0 * found.cost / n
+    found = lsq_linear(*least_squares(plant, s_0, z, np.eye(len(z))), bounds=(-2.0, 2.0), tol=1e-14)
+    return found.x, 2.0 * found.cost / len(z)
 
 
 def episodes(plant, batch, seed=0):
@@ -145,32 +146,19 @@ class RateLimited(LinearQuadratic):
         return super().running_cost(t, state[..., :2], applied, exogenous)
 
     def draw_initial_state(self, batch, generator):
-        return 2.0 * super().draw_initial_state(batch, generator) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        return super().draw_initial_state(batch, generator) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
 
 
 def program(plant, s_0, z):
     """The optimal actions and their J_a, as a least-squares problem in the bounded changes of the force."""
-    A, B, D, Q, R = matrices(plant)
-    n, root = len(z), np.linalg.cholesky(Q).T
-    sums, rows, rest = np.tril(np.ones((n, n))), [], []
-    gain, free = np.zeros((2, n)), s_0.copy()
-    for k in range(n):
-        rows += [root @ gain, np.sqrt(R[0, 0]) * sums[k : k + 1]]
-        rest += [root @ free, np.zeros(1)]
-        gain, free = A @ gain + B * sums[k : k + 1], A @ free + D[:, 0] * z[k]
-    bounds = -plant.step_limit, plant.step_limit
-    found = lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=bounds, tol=1e-14)
-    return sums @ found.x, 2.0 * found.cost / n
-
-
-def limited_episodes(plant, batch, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)
+    sums, bounds = np.tril(np.ones((len(z), len(z)))), (-plant.step_limit, plant.step_limit)
+    found = lsq_linear(*least_squares(plant, s_0, z, sums), bounds=bounds, tol=1e-14)
+    return sums @ found.x, 2.0 * found.cost / len(z)
 
 
 def test_the_optimum_is_that_of_a_quadratic_program_in_the_rates():
     plant = RateLimited(horizon=4.0, noise=0.5)
-    state, exogenous = limited_episodes(plant, 3)
+    state, exogenous = episodes(plant, 3)
     starts = {"constant": constant_starts(plant, 3, plant.n_steps)["constant 0.25"]}
     starts["random"] = random_start(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
     config = BoundedDescentConfig(iterations=2000, tolerance=0.0)
@@ -187,7 +175,7 @@ def test_the_optimum_is_that_of_a_quadratic_program_in_the_rates():
 
 def test_the_gradient_is_that_of_central_differences_before_and_after_a_charge():
     plant = RateLimited(horizon=1.0, noise=0.5)
-    state, exogenous = limited_episodes(plant, 2)
+    state, exogenous = episodes(plant, 2)
     cost = RelaxedCost(plant, constant(plant.closure), terminal=lambda end: end[:, 0] ** 2)
     cost.begin(state, exogenous)
     unit = np.random.default_rng(0).random((2, 10, 1))
@@ -263,8 +251,6 @@ def test_a_cost_without_finite_ranges_is_refused():
     plant.actions = (Signal(symbol="a", name="force", unit="N"),)
     with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
         CommandCost(plant, plant.closure)
-    with pytest.raises(ValueError, match="hold=0"):
-        CommandCost(LinearQuadratic(), plant.closure, hold=0)
 
 
 def test_the_descent_solves_a_bounded_least_squares_problem():

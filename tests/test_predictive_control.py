@@ -9,7 +9,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
-from test_optimal_control import matrices
+from test_optimal_control import least_squares
 
 from rt_torchrl.control.forecasts import Decaying, Held, Scattered
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
@@ -29,9 +29,9 @@ def control(plant=PLANT, closure=None, **options):
     return PredictiveControl(plant, closure or plant.closure, PredictiveConfig(horizon=1.0, **options))
 
 
-def episodes(plant=PLANT, batch=2, seed=1):
+def episodes(batch=2, seed=1):
     generator = seeded(seed)
-    return plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)
+    return PLANT.draw_initial_state(batch, generator), PLANT.draw_exogenous(batch, generator)
 
 
 def on_the_real_system(controller, env, *, strength=0.0):
@@ -108,25 +108,6 @@ def test_it_plans_on_the_closure_as_it_is_trained():
     assert {name for name, _ in controller.named_parameters()} == {"closure.matrix"}
 
 
-def test_its_forecast_is_that_of_the_inputs_met():
-    controller, records = control(forecast="decaying"), PLANT.draw_exogenous(40, seeded(9))
-    state, exogenous = episodes()
-    before = controller.fly(state, exogenous).actions
-    held = RecedingHorizon(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0))
-    held.prepare(PLANT.draw_initial_state(1, g := seeded()), PLANT.draw_exogenous(1, g)[:, 0])
-    torch.testing.assert_close(before, held.fly(state, exogenous).actions, rtol=0.0, atol=0.0)
-    controller.learn(records)
-    fitted = Decaying.fitted(records, dt=PLANT.dt, horizon=1.0)
-    assert torch.equal(controller.forecast.mean, fitted.mean) and torch.equal(controller.forecast.time, fitted.time)
-    again = control(forecast="decaying")
-    again.load_state_dict(controller.state_dict())
-    after = controller.fly(state, exogenous).actions
-    assert torch.equal(again.fly(state, exogenous).actions, after) and not torch.allclose(after, before, atol=1e-3)
-    still = control(forecast="held")
-    still.learn(records)
-    assert torch.equal(still.fly(state, exogenous).actions, before)
-
-
 def test_the_first_action_is_never_late():
     """The plan that is made before the episode begins goes on; without it the first solve has no deadline."""
     controller, (state, exogenous) = control(deadline=1e-9), episodes(batch=1)
@@ -169,8 +150,6 @@ def test_what_cannot_be_is_refused():
     controller = control()
     with pytest.raises(ValueError, match="no function of the observation.*--role model_free"):
         controller(torch.zeros(1, 2).double())
-    with pytest.raises(ValueError, match="virtual_episodes=0"):
-        PredictiveConfig(virtual_episodes=0)
     actor = LivePolicy(PLANT, controller, ExplorationConfig(), generator=seeded())
     with pytest.raises(ValueError, match="PredictiveControl acts from state and exogenous input; give both"):
         actor(torch.zeros(1, 2).double())
@@ -226,19 +205,13 @@ def controller(forecast, **options):
 
 def program(s_0, futures, shared):
     """The optimal variables of all futures, which share their first commands, as a bounded least-squares problem."""
-    A, B, D, Q, R = matrices(PLANT)
-    root, count = np.linalg.cholesky(Q).T, len(futures)
-    variables = shared + count * (N - shared)
-    rows, rest = [], []
+    later, parts = np.eye(len(futures) * (N - shared)), []
     for i, z in enumerate(futures):
-        gain, free = np.zeros((2, variables)), s_0.copy()
-        for k in range(N):
-            column = k if k < shared else shared + i * (N - shared) + k - shared
-            rows += [root @ gain, np.sqrt(R[0, 0]) * np.eye(variables)[column : column + 1]]
-            rest += [root @ free, np.zeros(1)]
-            gain, free = A @ gain, A @ free + D[:, 0] * z[k]
-            gain[:, column] += B[:, 0]
-    return lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14).x
+        mine = later[i * (N - shared) : (i + 1) * (N - shared)]
+        first = np.eye(shared, shared + len(later))
+        parts.append(least_squares(PLANT, s_0, z, np.concatenate([first, np.pad(mine, ((0, 0), (shared, 0)))])))
+    matrix, side = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return lsq_linear(matrix, side, bounds=(-2.0, 2.0), tol=1e-14).x
 
 
 @pytest.mark.parametrize("shared", [1, 3])
@@ -296,22 +269,26 @@ def test_futures_have_the_moments_of_the_errors():
     assert one @ moments @ one / (one @ one) == pytest.approx(np.linalg.eigvalsh(moments)[-1])
 
 
-def test_it_acts_as_a_policy_whose_scatter_is_learned_and_kept():
-    generator = torch.Generator().manual_seed(2)
-    state, exogenous = PLANT.draw_initial_state(2, generator), PLANT.draw_exogenous(2, generator)
-    config = PredictiveConfig(horizon=1.0, forecast="scattered")
-    certain = PredictiveControl(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0, forecast="held"))
-    policy, again = (PredictiveControl(PLANT, PLANT.closure, config) for _ in range(2))
-    held = certain.fly(state, exogenous).actions
-    torch.testing.assert_close(policy.fly(state, exogenous).actions, held, rtol=1e-2, atol=1e-2)  # nothing is met yet
-    records = PLANT.draw_exogenous(9, generator).cumsum(1)
+@pytest.mark.parametrize(("name", "change"), [("held", 0.0), ("decaying", 0.0), ("scattered", 1e-2)])
+def test_its_forecast_is_that_of_the_inputs_met_and_is_kept(name, change):
+    (state, exogenous), records = episodes(seed=2), PLANT.draw_exogenous(9, seeded(9)).cumsum(1)
+    policy, again = control(forecast=name), control(forecast=name)
+    held, before = (each.fly(state, exogenous).actions for each in (control(forecast="held"), policy))
+    torch.testing.assert_close(before, held, rtol=change, atol=change)  # nothing is met yet
     policy.learn(records[:, :6])  # shorter than the window
-    found = policy.forecast
-    assert found.deviations.shape == (4, 10, 1) and (found.deviations[:, 5:] == found.deviations[:, 5:6]).all()
+    if name == "scattered":
+        deviations = policy.forecast.deviations
+        assert deviations.shape == (4, 10, 1) and (deviations[:, 5:] == deviations[:, 5:6]).all()
     policy.learn(records)
     fitted = Decaying.fitted(records, dt=PLANT.dt, horizon=1.0)
-    scatter = Scattered.fitted(fitted, records, dt=PLANT.dt, horizon=1.0)
-    assert torch.equal(found.deviations, scatter.deviations[:, :10])
-    assert torch.equal(found.low, records.amin((0, 1))) and torch.equal(found.high, records.amax((0, 1)))
+    if name == "decaying":
+        assert torch.equal(policy.forecast.mean, fitted.mean) and torch.equal(policy.forecast.time, fitted.time)
+    if name == "scattered":
+        scatter = Scattered.fitted(fitted, records, dt=PLANT.dt, horizon=1.0)
+        assert torch.equal(policy.forecast.deviations, scatter.deviations[:, :10])
+        assert torch.equal(policy.forecast.low, records.amin((0, 1)))
+        assert torch.equal(policy.forecast.high, records.amax((0, 1)))
     again.load_state_dict(policy.state_dict())
-    assert torch.equal(again.fly(state, exogenous).actions, policy.fly(state, exogenous).actions)
+    after = policy.fly(state, exogenous).actions
+    assert torch.equal(again.fly(state, exogenous).actions, after)
+    assert torch.allclose(after, before, atol=1e-3) == (name == "held")
