@@ -105,7 +105,7 @@ def folds_of(record: SensorRecord, count: int) -> Iterator[tuple[list[SensorReco
     cuts = [round(k * n / count) for k in range(count + 1)]
 
     def part(first: int, last: int) -> SensorRecord:
-        return record.part(first, last, dt, guess(record.readings[first]))
+        return record.part(first, last, dt)._replace(guess=guess(record.readings[first]))
 
     for first, last in itertools.pairwise(cuts):
         yield [part(*ends) for ends in ((0, first), (last, n)) if ends[1] > ends[0]], part(first, last)

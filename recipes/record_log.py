@@ -13,6 +13,7 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 import tyro
+from pydantic import Field
 from torch import Tensor, nn
 
 from rt_torchrl import ClassicalController, Plant, configuration, main_of, rk4_step
@@ -55,12 +56,10 @@ class Config:
     states: tuple[str, ...] = ()
     seed: int = 0
     horizon: float | None = None
-    noise: float = 0.005
-    gap: float = 0.02
+    noise: Annotated[float, Field(ge=0, lt=1)] = 0.005
+    gap: Annotated[float, Field(ge=0, lt=0.5)] = 0.02
 
     def __post_init__(self):
-        if not 0.0 <= self.gap < 0.5:
-            raise ValueError(f"gap={self.gap} must lie in [0, 0.5), a share of the log.")
         known = [state.name for state in logged_states(plant_class(self.plant))]
         unknown = [name for name in self.states if name not in known]
         if unknown:
@@ -106,11 +105,8 @@ def recorded(
         noise: standard deviation of the sensors of the states, as a share of the value that they read.
 
     Raises:
-        ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
+        ValueError: if there is jitter and the plant has a scheme of its own.
     """
-    for name, share in (("jitter", jitter), ("noise", noise)):
-        if not 0.0 <= share < 1.0:
-            raise ValueError(f"{name}={share} must lie in [0, 1): a share of dt, or of what the sensors read.")
     if jitter and plant.own_scheme:
         raise ValueError(
             f"jitter={jitter}: plant {plant.name!r} steps by a scheme of its own; record it with jitter=0."

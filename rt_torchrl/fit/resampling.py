@@ -72,14 +72,21 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
     cuts = np.union1d(np.flatnonzero(intervals > limit * (1.0 + ROUNDING)), left_out)
     ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
-    parts = [(first, last, _steps(log.times[first], log.times[last], plant.dt)) for first, last in ends]
+    parts = [(k, last, int((log.times[last] - log.times[k]) / plant.dt + ROUNDING)) for k, last in ends]
     too_short = [(float(log.times[first]), float(log.times[last])) for first, last, steps in parts if steps < shortest]
     enough = [part for part in parts if part[2] >= shortest]
-    _require_rows(log, sum(steps for *_, steps in enough), interval, plant)
+    rows, steps = len(log.times), sum(steps for *_, steps in enough)
+    if steps > INTERVALS_PER_ROW * rows:  # before it takes memory
+        raise ValueError(
+            f"column 'time' of the log has a median step of {interval:g} s, so that {rows} rows would become {steps} "
+            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s), more than {INTERVALS_PER_ROW} for each "
+            "row. Times are in seconds: say the unit of the column, such as --columns ms=time*1e-3; or give the twin a "
+            "longer dt."
+        )
     segments = [_segment(log, slice(first, last + 1), steps, plant) for first, last, steps in enough]
     if not segments:
         raise ValueError(
-            f"log of {len(log.times)} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
+            f"log of {rows} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
             f"longer than {limit:g} s or a row that was left out ({len(left_out)} such places); raise --gap above "
             f"{interval:g} s, its median sampling interval, or log longer."
         )
@@ -131,22 +138,6 @@ def hold_means(times: Rows, values: Rows, grid: Samples) -> Float[np.ndarray, " 
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
 
 
-def _require_rows(log: SensorLog, steps: int, interval: float, plant: Plant) -> None:
-    """Refuse a log that would give far more control intervals than it has rows, before it takes memory."""
-    rows = len(log.times)
-    if steps > INTERVALS_PER_ROW * rows:
-        raise ValueError(
-            f"column 'time' of the log has a median step of {interval:g} s, so that {rows} rows would become {steps} "
-            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s), more than {INTERVALS_PER_ROW} for each "
-            "row. Times are in seconds: say the unit of the column, such as --columns ms=time*1e-3; or give the twin a "
-            "longer dt."
-        )
-
-
-def _steps(first: float, last: float, dt: float) -> int:
-    return int((last - first) / dt + ROUNDING)
-
-
 def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajectory:
     times = log.times[rows]
     grid = times[0] + plant.dt * np.arange(steps + 1)
@@ -158,11 +149,11 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
         return torch.from_numpy(values)
 
     actions, exogenous = held(plant.actions), plant.with_previews(held(plant.acting_inputs)[None])[0]
-    measured = {
-        state.name: torch.from_numpy(_interpolated(state, times, log.columns[state.name][rows], grid))
-        for state in logged_states(plant)
-        if state.name in log.columns
-    }
+    measured = {}
+    for state in logged_states(plant):
+        if state.name in log.columns:
+            values = _unwrapped(state, log.columns[state.name][rows])
+            measured[state.name] = torch.from_numpy(state.wrapped(np.interp(grid, times, values)))
     states = plant.complete_states(measured, exogenous, actions)
     seen = torch.zeros(steps + 1, dtype=torch.bool)
     nearest = np.rint((times - times[0]) / plant.dt).astype(int)
@@ -170,10 +161,9 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
     return Trajectory(states, actions, exogenous, float(times[0]), None if seen.all() else seen)
 
 
-def _interpolated(state: Signal, times: Rows, values: Rows, grid: Samples) -> Samples:
-    if state.periodic:
-        values = np.unwrap(values, period=state.period)
-    return state.wrapped(np.interp(grid, times, values))
+def _unwrapped(signal: Signal, values: Rows) -> Rows:
+    """The values without jumps by a turn; they go the short way round from row to row."""
+    return np.unwrap(values, period=signal.period) if signal.periodic else values
 
 
 def hidden_states(plant: Plant, log: SensorLog) -> list[str]:
@@ -287,8 +277,7 @@ def _samples(signal: Signal, times: Rows, values: Rows, grid: Samples, gap: floa
     times, values = times[seen], values[seen]
     if len(times) < 2:
         return np.full(len(grid), np.nan)
-    if signal.periodic:
-        values = np.unwrap(values, period=signal.period)
+    values = _unwrapped(signal, values)
     found = np.interp(grid, times, values, left=np.nan, right=np.nan)
     slack = ROUNDING * np.median(np.diff(grid))
     after = np.clip(np.searchsorted(times, grid - slack), 1, len(times) - 1)

@@ -125,11 +125,7 @@ def with_biases(sensors: Sequence[Sensor], names: Sequence[str]) -> tuple[Sensor
 
 
 def read(
-    sensors: Sequence[Sensor],
-    plant: Plant,
-    t: Time,
-    state: State,
-    exogenous: Input,
+    sensors: Sequence[Sensor], plant: Plant, t: Time, state: State, exogenous: Input
 ) -> Float[Tensor, "*batch n_y"]:
     """What the sensors would read without noise and bias."""
     found = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
@@ -172,26 +168,15 @@ class SensorRecord(NamedTuple):
         """Whether there is a sample."""
         return ~self.readings.isnan()
 
-    def part(self, first: int, last: int, dt: float, guess: Float[Tensor, " n_s"] | None = None) -> "SensorRecord":
+    def part(self, first: int, last: int, dt: float) -> "SensorRecord":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the samples around them.
 
-        Args:
-            first, last: numbers of intervals.
-            dt: control interval [s].
-            guess: first guess of the state there; by default that of the course, or else the record's own.
+        Its first state is guessed by the course, or else by the record's own guess.
         """
         held, samples = slice(first, last), slice(first, last + 1)
         course = None if self.course is None else self.course[samples]
-        if guess is None:
-            guess = self.guess if course is None else course[0]
-        return SensorRecord(
-            self.readings[samples],
-            self.actions[held],
-            self.exogenous[held],
-            guess,
-            self.start + first * dt,
-            course=course,
-        )
+        guess, start = self.guess if course is None else course[0], self.start + first * dt
+        return SensorRecord(self.readings[samples], self.actions[held], self.exogenous[held], guess, start, course)
 
 
 def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -> SensorRecord:

@@ -144,7 +144,11 @@ class Uncertainty:
         R = self.correlations()
         for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():
             if not {self.names[i], self.names[j]} & set(nothing):
-                found.append(self._pair(i, j, R[i, j].item()))
+                kept = "ratio" if R[i, j] > 0.0 else "product"
+                found.append(
+                    f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kept}, better "
+                    f"than each of them (correlation {R[i, j].item():.4f})"
+                )
         return found
 
     def _untold(self, names: list[str]) -> list[str]:
@@ -163,13 +167,6 @@ class Uncertainty:
             f"the data cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {rank} combination(s) of them are "
             f"free. Measure more, or fix {rank} of them"
         ]
-
-    def _pair(self, i: int, j: int, correlation: float) -> str:
-        kept = "ratio" if correlation > 0.0 else "product"
-        return (
-            f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kept}, better than "
-            f"each of them (correlation {correlation:.4f})"
-        )
 
 
 def normal_factor(level: float) -> float:
