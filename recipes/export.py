@@ -17,6 +17,7 @@ from rt_torchrl import (
     configuration,
     export_c,
     export_controller,
+    export_discon,
     export_onnx,
     export_program,
     export_twin,
@@ -28,8 +29,9 @@ from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
 from rt_torchrl.runs.settings import read_settings
 
-FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c",), "twin": ("c",)}
+FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c", "discon"), "twin": ("c",)}
 """The formats that there are of each thing."""
+KINDS = tuple(dict.fromkeys(kind for kinds in FORMATS.values() for kind in kinds))
 DEFAULT = ("c", "pt2")
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
@@ -42,10 +44,11 @@ class Config:
         run: run folder of any recipe.
         what: one or more of policy (from the observation to the action), controller (from the measured signals to the
             action, with filters and integrals) and twin (one control interval with the learned closure, of the
-            hypothesis that explains the records best); controller and twin are written in C alone.
+            hypothesis that explains the records best); controller and twin are written in C, a turbine's controller as
+            a DISCON too.
         role: role of the policy, model_based or model_free.
-        formats: one or more of c (C99 file and header), onnx (with the extra export) and pt2 (torch.export); by
-            default c, and pt2 of a policy.
+        formats: one or more of c (C99 file and header), onnx (with the extra export), pt2 (torch.export) and discon
+            (shared library with the interface of Bladed, and its C file discon.c); by default c, and pt2 of a policy.
         output: folder for the files; by default RUN/exported.
         name: name of the files and of the C function, to which _controller or _twin is added; by default PLANT_ROLE,
             and PLANT for the twin.
@@ -63,7 +66,7 @@ class Config:
 
     def __post_init__(self):
         formats = DEFAULT if self.formats is None else self.formats
-        for option, given, known in (("what", self.what, FORMATS), ("formats", formats, WRITERS)):
+        for option, given, known in (("what", self.what, FORMATS), ("formats", formats, KINDS)):
             if not given or not set(given) <= set(known):
                 raise ValueError(f"{option}={given} must be some of {', '.join(known)}.")
         for what in self.what:
@@ -114,7 +117,8 @@ def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) 
         error = WRITERS[kind](run.policy(config.role), path, plant, **named)
         found = "" if error is None else f"within {error:.1e} of the actions' ranges"
     elif what == "controller":
-        flown = export_controller(run.policy(config.role), path, plant, name=name)
+        path, writer = (output / "discon.c", export_discon) if kind == "discon" else (path, export_controller)
+        flown = writer(run.policy(config.role), path, plant, name=name)
         found = (
             ""
             if flown is None

@@ -22,6 +22,7 @@ from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .plants.sensors import StackedObservations
 from .contract import ContractReport, PlantContractError, check_plant
 from .control.classical import ClassicalController
+from .control.discon import DISCON
 
 # Real systems
 from .systems.adapters import CallingSimulator, EpisodeAbandoned, FMUEnvironment, FMUError
@@ -87,11 +88,13 @@ from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
 from .export.fmu import export_policy_fmu, export_twin_fmu
+from .export.discon import export_discon
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
 
 __all__ = [
+    "DISCON",
     "PAPER",
     "ActorCritic",
     "Actuation",
@@ -218,6 +221,7 @@ __all__ = [
     "control_cost",
     "export_c",
     "export_controller",
+    "export_discon",
     "export_onnx",
     "export_policy_fmu",
     "export_program",

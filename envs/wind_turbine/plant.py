@@ -150,6 +150,7 @@ class WindTurbine(Plant):
     air_density = 1.225  # ρ [kg/m³]
     gear_ratio = 97.0  # N_g [-]
     rated_power = 5e6  # P_N [W], electrical; at the shaft the rated torque and speed make 5.297 MW
+    generator_efficiency = rated_power / (RATED_TORQUE * RATED_GENERATOR_SPEED)  # 94.4 %
     rated_rotor_speed = RATED_ROTOR_SPEED
     rated_wind_speed = 11.4  # [m/s]
     rated_generator_speed = RATED_GENERATOR_SPEED
