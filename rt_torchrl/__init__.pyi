@@ -81,6 +81,7 @@ from .interruption import require_finished
 from .loading import begin_loading
 from .options import configuration
 from .runs.compare import Comparison, compare_runs
+from .runs.diagnosis import Reason, diagnose
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run
 from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
@@ -170,6 +171,7 @@ __all__ = [
     "Reading",
     "RealController",
     "RealSystem",
+    "Reason",
     "RecedingHorizon",
     "RecedingHorizonPlanner",
     "RecordedFlights",
@@ -219,6 +221,7 @@ __all__ = [
     "compare_runs",
     "configuration",
     "control_cost",
+    "diagnose",
     "export_c",
     "export_controller",
     "export_discon",

@@ -1,0 +1,144 @@
+"""Good twin, poor policy: which of five reasons holds in a finished run, and what says so."""
+
+import copy
+import math
+from typing import Any, NamedTuple
+
+import torch
+
+from rt_torchrl.evaluation.limits import exact_optimum, predictive
+from rt_torchrl.evaluation.unseen import VALIDATION_SEED, UnseenEpisodes
+from rt_torchrl.plants.shapes import Costs
+from rt_torchrl.runs.loaded_run import LoadedRun
+from rt_torchrl.steps.belief import QUIET, alarm
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+
+MINIMUM, CLASS, INPUTS, MERIT = 0.03, 0.1, 0.2, 0.2
+"""Shares of J_a from which a better minimum, a better controller and dearer inputs count, and share of a merit."""
+
+
+class Reason(NamedTuple):
+    """A reason why a policy may be poor.
+
+    Attributes:
+        name: the reason.
+        holds: whether it holds; None where the run does not say.
+        evidence: the numbers that say so, in words.
+        remedy: what to change where it holds.
+    """
+
+    name: str
+    holds: bool | None
+    evidence: str
+    remedy: str
+
+
+def diagnose(run: LoadedRun, *, episodes: int = 5) -> list[Reason]:
+    """Ask a finished run why its live policy is not better; each reason is checked by itself.
+
+    What is computed flies the twin that is most likely to be right, in episodes that no training has drawn: the real
+    system is not needed. It takes as long as a few plans.
+
+    Args:
+        run: the finished run.
+        episodes: number of episodes, at least 2.
+
+    Raises:
+        DivergenceError: if the twin diverges under the policy.
+    """
+    policy, believed = run.policy(run.live), run.twin.believed
+    unseen = UnseenEpisodes(believed.plant, episodes)
+    unseen.closure, unseen.physics = believed.closure, run.physics
+    costs = unseen.control_costs(policy)
+    best, minimum = _minimum(run, unseen, costs)
+    return [_twin(run), minimum, _class(run, unseen, best), _inputs(run, costs), _merits(run)]
+
+
+def _dearer(costs: Costs, others: Costs, share: float) -> bool:
+    """Whether costs are above others by more than a share on average, and by more than twice the standard error."""
+    above = costs - others
+    mean, error = above.mean().item(), above.std().item() / math.sqrt(len(above))
+    return mean > share * abs(others.mean().item()) and mean > 2.0 * error
+
+
+def _twin(run: LoadedRun) -> Reason:
+    """Whether the twin says what the last real episodes cost."""
+    spread = run.config.twinning.exploration.spread
+    quiet = [
+        entry["paired_difference"]
+        for entry in run.metrics["episodes"]
+        if "paired_difference" in entry and spread * entry["exploration"] <= QUIET
+    ]
+    name, remedy = "the twin is wrong where it matters", "hypotheses about what it lacks, or another closure"
+    if not quiet:
+        return Reason(name, None, "no real episode without exploration was flown again on the twin", remedy)
+    last = ", ".join(f"{math.exp(d):.3g}" for d in quiet[-2:])
+    return Reason(name, alarm(quiet) is not None, f"the last real episodes cost {last} times what it says", remedy)
+
+
+def _minimum(run: LoadedRun, unseen: UnseenEpisodes, costs: Costs) -> tuple[Costs, Reason]:
+    """The least costs of this class of policies that are found on the twin, and whether the policy is far above them.
+
+    What is best on some episodes is not so on others: weights are sought on validation episodes.
+    """
+    name, remedy = "the plan is in a poor minimum", "more twinning.planner.starts or iterations, or another --seed"
+    role, policy = run.live, run.policy(run.live)
+    if isinstance(policy, StateFeedback):
+        return costs, Reason(name, None, f"{type(policy).__name__} has no weights that are planned", remedy)
+
+    def drawn(generator: torch.Generator) -> torch.nn.Module:
+        return run.config.make_policies(run.physics, generator)[role]
+
+    def present(generator: torch.Generator) -> torch.nn.Module:
+        return copy.deepcopy(policy)
+
+    chosen_on = UnseenEpisodes(unseen.plant, len(costs), seed=VALIDATION_SEED)
+    chosen_on.closure = unseen.closure
+    candidates = exact_optimum(chosen_on, drawn), exact_optimum(chosen_on, present, starts=1)
+    best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
+    evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
+    return min(costs, best, key=torch.mean), Reason(name, _dearer(costs, best, MINIMUM), evidence, remedy)
+
+
+def _class(run: LoadedRun, unseen: UnseenEpisodes, best: Costs) -> Reason:
+    """Whether a controller that plans at every step is better on the twin than the best policy of the class."""
+    name = "the class of policies is too small"
+    remedy = "further observations, --policy mlp with more hidden units, or model predictive control (--preset mpc)"
+    known = run.config.limit()
+    window = run.config.twinning.planner.receding_horizon if known is None else known.window
+    if window is None:
+        return Reason(name, None, "model predictive control finds no plans for this plant", remedy)
+    found = best.new_tensor(predictive(unseen, window).costs)
+    evidence = f"model predictive control costs {found.mean():.4g} on the twin, the best of the class {best.mean():.4g}"
+    return Reason(name, _dearer(best, found, CLASS), evidence, remedy)
+
+
+def _inputs(run: LoadedRun, costs: Costs) -> Reason:
+    """Whether episodes that no training has drawn cost more on the twin than those that plans were made on."""
+    name = "unseen inputs differ from those that plans were made on"
+    remedy = "records of other conditions, or twinning.exogenous as the inputs really scatter"
+    planned = [entry["J_a_plan"] for entry in run.metrics["episodes"] if math.isfinite(entry.get("J_a_plan", math.nan))]
+    if not planned:
+        return Reason(name, None, "no plan was made", remedy)
+    evidence = f"unseen episodes cost {costs.mean():.4g} on the twin, the last plan expected {planned[-1]:.4g}"
+    return Reason(name, _dearer(costs, costs.new_full((1,), planned[-1]), INPUTS), evidence, remedy)
+
+
+def _merits(run: LoadedRun) -> Reason:
+    """Whether the policy is cheaper than a classical controller, and yet another one in what users look at."""
+    name, remedy = "the cost is not what was meant", "weights of the cost (docs/observations_and_costs.md)"
+    unseen: dict[str, Any] = run.metrics["summary"].get("unseen", {})
+    live, others = run.live, unseen.get("baselines", {})
+    merit = unseen.get("merit", {}).get(live)
+    if not merit or not others:
+        return Reason(name, None, "no classical controller flew beside the policy, or the plant has no merit", remedy)
+    apart = []
+    for key, other in others.items():
+        if unseen[f"J_a_{live}"]["mean"] >= other["J_a"]["mean"]:
+            continue
+        for quantity, value in merit.items():
+            mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
+            if abs(mean - its_mean) > MERIT * abs(its_mean):
+                apart.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
+    evidence = "; ".join(apart) if apart else "it is cheaper than no classical controller, or alike in every merit"
+    return Reason(name, bool(apart), evidence, remedy)

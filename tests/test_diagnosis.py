@@ -1,0 +1,147 @@
+"""Why a policy is poor: each reason in a run of which it is true, and in one of which it is not."""
+
+import dataclasses
+import json
+from dataclasses import field
+from typing import Literal
+
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
+
+from rt_torchrl import (
+    ClassicalController,
+    ExplorationConfig,
+    PlannerConfig,
+    PredictiveConfig,
+    Run,
+    RunConfig,
+    TwinningConfig,
+    diagnose,
+    load_run,
+)
+from rt_torchrl.options import configuration
+from rt_torchrl.runs.diagnosis import Reason
+
+TWIN, MINIMUM, CLASS, INPUTS, COST = range(5)
+
+
+class Spring(LinearGain):
+    """a = −k e_1, which sees no velocity."""
+
+    def forward(self, observation):
+        return super().forward(observation[..., :1])
+
+
+class Pushed(LinearQuadratic):
+    """The oracle plant with a quantity of its own."""
+
+    def merit(self, states, actions, exogenous):
+        return {"mean force [N]": actions.abs().mean((-1, -2))}
+
+
+@configuration
+class Config(RunConfig):
+    """A model-based training of two episodes.
+
+    Args:
+        policy: full for a gain of both states, spring for one of the position.
+    """
+
+    policy: Literal["full", "spring"] = "full"
+    episodes: int = 2
+    unseen: int = 4
+    untrained: int = 0
+    figures: bool = False
+    compiled: bool = False
+    twinning: TwinningConfig = field(
+        default_factory=lambda: TwinningConfig(
+            arm="model_based",
+            exploration=ExplorationConfig(spread=0.0),
+            planner=PlannerConfig(starts=0, receding_horizon=PredictiveConfig(horizon=3.0)),
+        )
+    )
+
+    def plant(self):
+        return Pushed(noise=0.01)
+
+    def make_policy(self, plant, generator):
+        return LinearGain([[0.1, 0.1]]) if self.policy == "full" else Spring([[0.1]])
+
+
+class Still(ClassicalController):
+    """Does nothing."""
+
+    def law(self, state, memory, exogenous):
+        return torch.zeros(len(state), 1, dtype=torch.float64), memory
+
+
+def finished(folder, **options):
+    config = Config(log_dir=folder, **options)
+    Run(config, config.plant(), baselines={"still": Still}).train()
+    return load_run(folder, Config)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return finished(tmp_path)
+
+
+def rewrite(run, change):
+    """Let the run have had other results."""
+    metrics = run.metrics
+    change(metrics)
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+
+
+def test_a_run_that_ended_well_has_no_reason_but_that_it_acts_more(run):
+    reasons = diagnose(run)
+    assert [reason.holds for reason in reasons] == [False, False, False, False, True]
+    assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
+    assert "mean force [N]" in reasons[COST].evidence and "against 0 of still" in reasons[COST].evidence
+
+
+def test_a_policy_above_the_least_cost_of_its_class_is_in_a_poor_minimum(run):
+    gain = run.policy("model_based").gain
+    with torch.no_grad():
+        gain.copy_(torch.as_tensor(optimal_gain(1.0)))
+        assert not diagnose(run)[MINIMUM].holds
+        gain.mul_(0.3)
+    reason = diagnose(run)[MINIMUM]
+    assert reason.holds and "with the best weights" in reason.evidence
+
+
+def test_a_class_that_sees_too_little_is_too_small(tmp_path):
+    reasons = diagnose(finished(tmp_path, policy="spring"))
+    assert reasons[CLASS].holds and not reasons[MINIMUM].holds
+
+
+def test_an_alarm_is_a_twin_that_is_wrong(run):
+    rewrite(run, lambda metrics: [entry.update(paired_difference=0.7) for entry in metrics["episodes"]])
+    assert diagnose(run)[TWIN].holds and "cost 2.01, 2.01 times" in diagnose(run)[TWIN].evidence
+    twinning = dataclasses.replace(run.config.twinning, exploration=ExplorationConfig(spread=0.1))
+    explored = dataclasses.replace(run, config=dataclasses.replace(run.config, twinning=twinning))
+    assert diagnose(explored)[TWIN].holds is None
+
+
+def test_unseen_episodes_that_cost_more_than_planned_have_other_inputs(run):
+    rewrite(run, lambda metrics: metrics["episodes"][-1].update(J_a_plan=1e-3))
+    assert diagnose(run, episodes=12)[INPUTS].holds
+
+
+def test_what_a_run_does_not_say_is_no_reason(run):
+    def forget(metrics):
+        metrics["summary"]["unseen"]["baselines"] = {}
+        for entry in metrics["episodes"]:
+            entry.pop("J_a_plan")
+            entry.pop("paired_difference")
+
+    rewrite(run, forget)
+    reasons = diagnose(run)
+    assert [reasons[k].holds for k in (TWIN, INPUTS, COST)] == [None, None, None]
+
+
+def test_predictive_control_has_no_weights_in_a_minimum(tmp_path):
+    planner = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=3.0))
+    reasons = diagnose(finished(tmp_path, twinning=TwinningConfig(arm="model_based", planner=planner)), episodes=2)
+    assert reasons[MINIMUM].holds is None and not reasons[CLASS].holds
