@@ -94,11 +94,11 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     algorithm.episode()
     algorithm.referee.live = "model_based"
     judged = algorithm.virtual.draw(2)
-    record, switch = algorithm.short_term[-1], algorithm.module["switch"]
-    found = switch.clone(record, judged)
+    policies, clone = algorithm.policies, algorithm.module["switch"].imitation.clone
+    given = {"seen": algorithm.learner.observations, "record": algorithm.short_term[-1], "judged_on": judged}
+    found = clone(policies["model_based"], policies["model_free"], **given)
     assert 0.0 < found["distillation_error"] < 0.3
-    algorithm.referee.live = "model_free"
-    refused = switch.clone(record, judged)
+    refused = clone(policies["model_free"], policies["model_based"], **given)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()
 

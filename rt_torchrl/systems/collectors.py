@@ -190,7 +190,7 @@ class FlightCollector(EpisodeCollector):
         law = policy if isinstance(policy, Remembering) else None
         if isinstance(policy, StateFeedback) and law is None:
             return super().rollout()
-        pass_over(env)
+        env.pass_over()
         env.reset()
         closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn
         n, plant = exogenous.shape[1], env.plant
