@@ -1,5 +1,6 @@
 """Whole runs on the oracle plant that take seconds."""
 
+import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.runs.run import Run
@@ -22,6 +23,18 @@ SMALL = TwinningConfig(
     # No patience, so that swaps and clones happen within the few episodes of a test.
     referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),
 )
+
+
+@torch.no_grad()
+def stepped_cost(episodes, policy):
+    """Mean J_a of a policy without the library's rollout: the plant's step in a loop."""
+    plant, s, total = episodes.plant, episodes.initial_state, 0.0
+    for k in range(plant.n_steps):
+        t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
+        a = plant.actuate(s, policy(s))
+        total = total + plant.running_cost(t, s, a, z) / plant.n_steps
+        s = plant.step(t, s, a, z, episodes.closure).state
+    return total.mean().item()
 
 
 def small_run(folder, episodes=3, *, figures=False, **options):

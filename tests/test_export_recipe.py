@@ -7,20 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
-from test_run import SMALL
 
 from rt_torchrl import load_run
 from rt_torchrl.export import c_file
-from rt_torchrl.options import read_options
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig, physics_of
+from rt_torchrl.runs.run_config import physics_of
 from rt_torchrl.runs.settings import settings_of
 
 RECIPES = Path(__file__).parent.parent / "recipes"
-PLANTS = ("cryogenic_tank", "flapping_wing", "wind_turbine")
-OPTIONS = {"cryogenic_tank": "mlp", "flapping_wing": "paper", "wind_turbine": "bias"}
 
 
 def recipe(name):
@@ -33,7 +27,12 @@ def recipe(name):
 def leave_run(folder, name, **options):
     """Write the files of a run as Run.train writes them, with random weights."""
     config = config_class_of(RECIPES / f"{name}.py")(seed=3, log_dir=folder, **options)
-    plant, generator = physics_of(config), torch.Generator().manual_seed(7)
+    return config, leave_run_of(folder, config, physics_of(config))
+
+
+def leave_run_of(folder, config, plant):
+    """The same of any configuration and plant; return the policies and the closure."""
+    generator = torch.Generator().manual_seed(7)
     policies, closure = config.make_policies(plant, generator), config.make_closure(plant, generator)
     parts = {**config.acting_policies(policies, plant, closure), "closure": closure}
     with torch.no_grad():
@@ -43,44 +42,7 @@ def leave_run(folder, name, **options):
     settings = settings_of(config, plant.name)
     (folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
     torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
-    return config, parts
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_a_run_is_rebuilt(name, tmp_path):
-    config, parts = leave_run(tmp_path, name, policy=OPTIONS[name], horizon=3000.0, model_error=True, hidden=(3,))
-    run = load_run(tmp_path)
-    assert run.config == config and run.plant.horizon == 3000.0
-    for role, part in parts.items():
-        found = run.closure if role == "closure" else run.policy(role)
-        assert found.state_dict().keys() == part.state_dict().keys()
-        assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
-
-
-class OracleConfig(RunConfig):
-    def plant(self):
-        return LinearQuadratic(horizon=2.0)
-
-
-def test_what_a_training_leaves_is_read_back(tmp_path):
-    config = OracleConfig(
-        episodes=1, log_dir=tmp_path, compiled=False, unseen=2, figures=False, twinning=SMALL, noise=0.01
-    )
-    training = Run(config, config.plant())
-    training.train()
-    found = load_run(tmp_path)
-    assert found.config == config
-    for role, policy in training.algorithm.policies.items():
-        assert torch.equal(found.policy(role).gain, policy.gain)
-    assert torch.equal(found.closure.matrix, training.algorithm.twin.closure.matrix)
-
-
-def test_the_default_options_of_every_recipe_survive_json():
-    for name in PLANTS:
-        config = config_class_of(RECIPES / f"{name}.py")()
-        settings = json.loads(json.dumps(settings_of(config, name), default=str))
-        del settings["plant"], settings["recipe"]
-        assert read_options(type(config), settings) == config
+    return parts
 
 
 def test_the_recipe_writes_every_format(tmp_path, capsys):
@@ -146,46 +108,27 @@ def test_folders_that_hold_no_run_are_refused(tmp_path):
             load_run(folder, type(config))
 
     refusal(tmp_path, "is no run folder: it has no config.json")
-    for damage, message in {
-        "unfinished": "has no weights.pt: it is not finished.*--resume",
-        "torn": "weights.pt is damaged",
-        "no json": "config.json is damaged",
-        "no plant": "does not name a plant",
-        "other plant": "is a run of plant 'balloon', the recipe is of 'wind_turbine'",
-        "other policy": "weights of 'model_based' .* do not fit",
-        "other option": "has no option colour; it is of another version",
-        "other inner option": "Config has no option twinning.referee.colour; it is of another version",
-        "no number": "episodes='many' must be a whole number",
-        "no choice": "policy='cubic' does not exist; choose mlp, paper, bias or scheduled",
-        "lost wind": "cannot be carried out: .*gone.hh",
-    }.items():
-        folder = shutil.copytree(tmp_path / "run", tmp_path / damage.replace(" ", "_"))
-        damage_run(folder, damage)
-        refusal(folder, message)
-
-
-def damage_run(folder, damage):
+    folder = tmp_path / "run"
     settings = json.loads((folder / "config.json").read_text())
-    changes = {
-        "no json": None,
-        "no plant": {key: value for key, value in settings.items() if key != "plant"},
-        "other plant": settings | {"plant": "balloon"},
-        "other policy": settings | {"policy": "mlp"},
-        "other option": settings | {"colour": "red"},
-        "other inner option": settings | {"twinning": {"referee": {"colour": "red"}}},
-        "no number": settings | {"episodes": "many"},
-        "no choice": settings | {"policy": "cubic"},
-        "lost wind": settings | {"wind_files": ["gone.hh"]},
-    }
-    if damage == "unfinished":
-        (folder / "weights.pt").unlink()
-    elif damage == "torn":
-        (folder / "weights.pt").write_bytes((folder / "weights.pt").read_bytes()[:500])
-    else:
-        (folder / "config.json").write_text("{" if damage == "no json" else json.dumps(changes[damage]))
-
-
-def test_a_recipe_that_makes_no_plant_is_refused(tmp_path):
-    leave_run(tmp_path, "wind_turbine")
-    with pytest.raises(ValueError, match=r"RunConfig has no method plant\(\)"):
-        load_run(tmp_path, RunConfig)
+    for change, message in (
+        ({"plant": None}, "does not name a plant"),
+        ({"plant": "balloon"}, "is a run of plant 'balloon', the recipe is of 'wind_turbine'"),
+        ({"policy": "mlp"}, "weights of 'model_based' .* do not fit"),
+        ({"colour": "red"}, "has no option colour; it is of another version"),
+        (
+            {"twinning": {"referee": {"colour": "red"}}},
+            "Config has no option twinning.referee.colour; it is of another version",
+        ),
+        ({"episodes": "many"}, "episodes='many' must be a whole number"),
+        ({"policy": "cubic"}, "policy='cubic' does not exist; choose mlp, paper, bias or scheduled"),
+        ({"wind_files": ["gone.hh"]}, "cannot be carried out: .*gone.hh"),
+    ):
+        (folder / "config.json").write_text(json.dumps(settings | change))
+        refusal(folder, message)
+    (folder / "config.json").write_text(json.dumps(settings))
+    (folder / "weights.pt").write_bytes((folder / "weights.pt").read_bytes()[:500])
+    refusal(folder, "weights.pt is damaged")
+    (folder / "weights.pt").unlink()
+    refusal(folder, "has no weights.pt: it is not finished.*--resume")
+    (folder / "config.json").write_text("{")
+    refusal(folder, "config.json is damaged")

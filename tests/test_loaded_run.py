@@ -14,7 +14,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD
 from test_documentation import leave_finished_run
-from test_export_recipe import RECIPES, leave_run, recipe
+from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
 
 from rt_torchrl import Run, load_run
@@ -47,14 +47,20 @@ def combinations():
 @pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
 def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, other, tmp_path):
     options = {"policy": policy, "closure": closure, "model_free_policy": other, "hidden": (3,), "closure_hidden": (2,)}
+    options |= {"horizon": 3000.0} | ({} if plant == "pendulum" else {"model_error": True})
     config, parts = leave_run(tmp_path, plant, **options)
     run = load_run(tmp_path)
-    assert run.config == config and set(run.policies) == {"model_based", "model_free"}
+    assert run.config == config and set(run.policies) == {"model_based", "model_free"} and run.plant.horizon == 3000.0
     for role, part in parts.items():
         found = run.closure if role == "closure" else run.policy(role)
         assert type(found) is type(part)
-        assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
+        require_same_weights(found, part)
     assert isinstance(run.policy("model_free"), SaturatedMLP) >= (other == "mlp")
+
+
+def require_same_weights(found, expected):
+    its, ours = found.state_dict(), expected.state_dict()
+    assert its.keys() == ours.keys() and all(torch.equal(its[key], value) for key, value in ours.items())
 
 
 CHOICES = {
@@ -169,7 +175,7 @@ class Own(RunConfig):
 
 
 def test_a_plant_that_no_recipe_makes_is_given(tmp_path, unchecked):
-    _, parts = leave_run_of(tmp_path, Own())
+    parts = leave_run_of(tmp_path, Own(), LinearQuadratic())
     with pytest.raises(ValueError, match=r"Own has no method plant\(\).*give load_run the plant"):
         load_run(tmp_path)
     with pytest.raises(ValueError, match=r"plant=<class .* must be a plant; if this is a class, give an instance"):
@@ -180,35 +186,34 @@ def test_a_plant_that_no_recipe_makes_is_given(tmp_path, unchecked):
     assert type(run.config) is Own and torch.equal(run.policy("model_free").gain, parts["model_free"].gain)
 
 
-def leave_run_of(folder, config):
-    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(7)
-    parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
-    torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
-    (folder / "config.json").write_text(json.dumps(settings_of(config, plant.name), default=str))
-    return config, parts
+def name_recipe(folder, module, file, name="Config"):
+    """Let the settings of a run name this recipe."""
+    settings = json.loads((folder / "config.json").read_text())
+    settings["recipe"] = {"class": name, "module": module, "file": file}
+    (folder / "config.json").write_text(json.dumps(settings))
 
 
 def test_recipes_that_cannot_be_found_are_told(tmp_path):
-    leave_run_of(tmp_path, Own())
+    leave_run_of(tmp_path, Own(), LinearQuadratic())
     settings = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "evil.py").write_text("raise SystemExit('run')")
-    local = {"class": "make.<locals>.Config", "module": "room", "file": None}
-    for origin, message in {
-        None: "does not say which recipe made the run; give the recipe: its file",
-        json.dumps(local): "was defined on the way; give the recipe",
-        json.dumps({"class": "Config", "module": None, "file": str(tmp_path / "evil.py")}): "came with the folder",
-        json.dumps({"class": "Config", "module": None, "file": "evil.py"}): "came with the folder",
-        json.dumps({"class": "Config", "module": None, "file": "/gone.py"}): "/gone.py does not exist.*If it has moved",
-        json.dumps({"class": "Config", "module": "gone", "file": None}): "module gone .* is not imported.*give the rec",
-        json.dumps({"class": "Config", "module": "gone", "file": "/gone.py"}): "module gone .* is not imported",
-        json.dumps({"class": 3, "module": "gone", "file": None}): "does not say which recipe made the run",
-        json.dumps({"class": "Config", "module": 3, "file": None}): "does not say which recipe made the run",
-        json.dumps({"class": "Config", "module": None, "file": 3}): "does not say which recipe made the run",
-        json.dumps({"class": "Config", "module": "rt_torchrl", "file": None}): "defines no Config.*If it has moved",
-        json.dumps({"class": "Plant", "module": "rt_torchrl", "file": None}): "Plant is no class derived from RunConf",
-    }.items():
-        changed = settings | {"recipe": json.loads(origin) if origin else 0}
-        (tmp_path / "config.json").write_text(json.dumps(changed))
+    (tmp_path / "config.json").write_text(json.dumps(settings | {"recipe": 0}))
+    with pytest.raises(ValueError, match="does not say which recipe made the run; give the recipe: its file"):
+        load_run(tmp_path, plant=LinearQuadratic())
+    for name, module, file, message in (
+        ("make.<locals>.Config", "room", None, "was defined on the way; give the recipe"),
+        ("Config", None, str(tmp_path / "evil.py"), "came with the folder"),
+        ("Config", None, "evil.py", "came with the folder"),
+        ("Config", None, "/gone.py", "/gone.py does not exist.*If it has moved"),
+        ("Config", "gone", None, "module gone .* is not imported.*give the rec"),
+        ("Config", "gone", "/gone.py", "module gone .* is not imported"),
+        (3, "gone", None, "does not say which recipe made the run"),
+        ("Config", 3, None, "does not say which recipe made the run"),
+        ("Config", None, 3, "does not say which recipe made the run"),
+        ("Config", "rt_torchrl", None, "defines no Config.*If it has moved"),
+        ("Plant", "rt_torchrl", None, "Plant is no class derived from RunConf"),
+    ):
+        name_recipe(tmp_path, module, file, name)
         with pytest.raises(ValueError, match=message):
             load_run(tmp_path, plant=LinearQuadratic())
     for given, message in {
@@ -229,7 +234,7 @@ def evil(tmp_path, monkeypatch):
     """A run folder, the current folder, with code of its own, and a mark that is there once that code has run."""
     folder, mark = tmp_path / "run", tmp_path / "called"
     (folder / "pack").mkdir(parents=True)
-    leave_run_of(folder, Own())
+    leave_run_of(folder, Own(), LinearQuadratic())
     for name in ("evil.py", "pack/__init__.py", "pack/recipe.py"):
         (folder / name).write_text(CALLED.format(mark=str(mark)))
     (tmp_path / "outside.py").write_text("from rt_torchrl.runs.run_config import RunConfig\nConfig = RunConfig\n")
@@ -246,9 +251,7 @@ def evil(tmp_path, monkeypatch):
 @pytest.mark.parametrize("module", ["evil", "pack", "pack.recipe"])
 def test_a_module_of_the_run_folder_is_not_imported(module, file, evil):
     folder, mark = evil
-    settings = json.loads((folder / "config.json").read_text())
-    settings["recipe"] = {"class": "Config", "module": module, "file": file}
-    (folder / "config.json").write_text(json.dumps(settings))
+    name_recipe(folder, module, file)
     with pytest.raises(ValueError, match=r"is not (imported|run).*give the recipe"):
         load_run(folder, plant=LinearQuadratic())
     assert not mark.exists()
@@ -258,9 +261,7 @@ def test_a_module_of_the_run_folder_is_not_imported(module, file, evil):
 def test_a_recipe_elsewhere_does_not_make_way_for_a_module_of_the_run_folder(module, evil):
     """The file is imported; the packages of the module's name are those of the run folder."""
     folder, mark = evil
-    settings = json.loads((folder / "config.json").read_text())
-    settings["recipe"] = {"class": "Config", "module": module, "file": str(folder.parent / "outside.py")}
-    (folder / "config.json").write_text(json.dumps(settings))
+    name_recipe(folder, module, str(folder.parent / "outside.py"))
     assert type(load_run(folder, plant=LinearQuadratic()).config) is RunConfig
     assert not mark.exists()
 
@@ -273,9 +274,7 @@ def test_a_recipe_in_a_package_elsewhere_is_imported_by_its_name(evil, monkeypat
     (package / "base.py").write_text("from rt_torchrl.runs.run_config import RunConfig as Config\n")
     (package / "recipe.py").write_text("from .base import Config\n")
     monkeypatch.syspath_prepend(package.parent)
-    settings = json.loads((folder / "config.json").read_text())
-    settings["recipe"] = {"class": "Config", "module": "own_package.recipe", "file": str(package / "recipe.py")}
-    (folder / "config.json").write_text(json.dumps(settings))
+    name_recipe(folder, "own_package.recipe", str(package / "recipe.py"))
     assert type(load_run(folder, plant=LinearQuadratic()).config) is RunConfig
     assert "own_package.recipe" in sys.modules
 
@@ -309,7 +308,10 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     run = Run(RunConfig(episodes=1, log_dir=tmp_path, twinning=hypotheses, **options), Suspecting(horizon=2.0))
     run.train()
     trained = run.algorithm.twin
-    found = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0)).twin
+    loaded = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0))
+    for role, policy in run.algorithm.policies.items():
+        require_same_weights(loaded.policy(role), policy)
+    found = loaded.twin
     assert isinstance(found, TwinEnsemble) and found.weights == trained.weights
     assert found.twins.keys() == trained.twins.keys() == {ALONE, "late", "lags"}
     drawn = torch.Generator().manual_seed(0)
@@ -319,8 +321,7 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     policy = run.algorithm.policies["model_based"]
     assert found.cost(policy, *episodes) == trained.cost(policy, *episodes)
     for name, twin in trained.twins.items():
-        expected, its = twin.closure.state_dict(), found.twins[name].closure.state_dict()
-        assert its.keys() == expected.keys() and all(torch.equal(its[key], value) for key, value in expected.items())
+        require_same_weights(found.twins[name].closure, twin.closure)
     fresh = Suspecting(horizon=2.0).suspects()["lags"].closure.state_dict()
     assert any(not torch.equal(value, found.twins["lags"].closure.state_dict()[key]) for key, value in fresh.items())
     with pytest.raises(
@@ -392,8 +393,3 @@ def test_figures_show_the_episode_that_is_given(run):
 
 def test_the_table_has_a_row_for_each_episode(run):
     assert run.table()["real_cost"].tolist() == pytest.approx([0.1, 0.09])
-
-
-def test_without_results_the_message_names_the_file(run, tmp_path):
-    with pytest.raises(ValueError, match=r"has no metrics.json: it is not finished"):
-        dataclasses.replace(run, folder=tmp_path).table()

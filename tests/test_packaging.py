@@ -20,6 +20,7 @@ import rt_torchrl
 from rt_torchrl.runs import console
 
 ROOT = Path(__file__).parent.parent
+RECIPES = {path.stem for path in (ROOT / "recipes").glob("*.py")}
 MISSING = [name for name in ("build", "hatchling") if importlib.util.find_spec(name) is None]
 PROBE = """
 import rt_torchrl.envs.wind_turbine.plant as plant, rt_torchrl.envs as envs, sys
@@ -31,6 +32,12 @@ from rt_torchrl import Plant
 assert issubclass(plant.WindTurbine, Plant)
 print(plant.__file__)
 """
+
+
+def python(code, *words, cwd=ROOT, **options):
+    """What a piece of code does in a process of its own."""
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, **options)
 
 
 def test_checkout_imports_the_folder_under_one_name():
@@ -101,8 +108,9 @@ def wheel(tmp_path_factory):
     return found
 
 
-def test_wheel_maps_the_folder_and_holds_its_data(wheel):
-    names = set(zipfile.ZipFile(wheel).namelist())
+def test_the_wheel_maps_the_folder_and_holds_data_recipes_and_command(wheel):
+    archive = zipfile.ZipFile(wheel)
+    names = set(archive.namelist())
     data = {f"rt_torchrl/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "envs").glob("*/data/*") if p.is_file()}
     code = {p.relative_to(ROOT).as_posix() for p in (ROOT / "rt_torchrl").rglob("*.py")} - {"rt_torchrl/envs.py"}
     assert data | code <= names
@@ -112,20 +120,19 @@ def test_wheel_maps_the_folder_and_holds_its_data(wheel):
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     # No distribution-wide ``envs``, ``tests`` or ``recipes``, and no shim that would shadow the folder.
     assert tops == {"rt_torchrl"} and "rt_torchrl/envs.py" not in names
-
-
-def test_wheel_has_the_version_that_the_package_states(wheel):
+    assert {Path(name).stem for name in names if re.fullmatch(r"rt_torchrl/recipes/[^/]*", name)} == RECIPES
     assert wheel.name.startswith(f"rt_torchrl-{rt_torchrl.__version__}-")
-    metadata = zipfile.ZipFile(wheel).read(f"rt_torchrl-{rt_torchrl.__version__}.dist-info/METADATA").decode()
+    about = f"rt_torchrl-{rt_torchrl.__version__}.dist-info/"
+    metadata, commands = (archive.read(about + name).decode() for name in ("METADATA", "entry_points.txt"))
     assert f"\nVersion: {rt_torchrl.__version__}\n" in metadata and "\nClassifier: Typing :: Typed\n" in metadata
+    assert "rt-torchrl = rt_torchrl.runs.console:main" in commands
 
 
 @pytest.mark.slow
 def test_wheel_works_without_the_checkout(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     # The extracted wheel stands before a checkout that may be installed.
-    command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n" + PROBE]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    done = python(f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n" + PROBE, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).is_relative_to(tmp_path.resolve())
 
@@ -204,14 +211,24 @@ def test_a_name_that_does_not_exist_is_refused():
         rt_torchrl.Plnt  # noqa: B018
 
 
-def test_the_import_waits_for_nothing():
-    """A user who asks for a version, or misspells a command, needs neither PyTorch nor TorchRL."""
-    code = (
-        "import sys, rt_torchrl; rt_torchrl.__version__, dir(rt_torchrl)\n"
-        "print([name for name in ('torch', 'torchrl', 'sklearn', 'scipy', 'matplotlib') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import rt_torchrl; rt_torchrl.__version__, dir(rt_torchrl)",
+        "from rt_torchrl.runs.console import main; main([])",
+    ],
+    ids=["import", "list of recipes"],
+)
+def test_who_misspells_a_command_waits_for_nothing(code):
+    late = ("torch", "torchrl", "sklearn", "scipy", "matplotlib")
+    done = python(f"{code}\nimport sys; print([name for name in {late} if name in sys.modules])")
+    assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
+
+
+READ = {"paper", "paper_figures"}
+"""Recipes whose parts stand at the top, because they are read as much as run."""
+LATE = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem not in READ]
+"""The others, which load what a command does not need only after its options."""
 
 
 def test_the_help_of_a_recipe_waits_for_pytorch_alone():
@@ -225,17 +242,12 @@ def test_the_help_of_a_recipe_waits_for_pytorch_alone():
         "        'torchrl', 'torchdiffeq', 'onnx', 'jax')\n"
         "print([name for name in late if name in sys.modules])"
     )
-    read = {"paper", "paper_figures"}  # their parts stand at the top, because they are read as much as run
-    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem not in read]
-    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
+    done = python(code, *LATE)
     helped = [line for line in done.stdout.splitlines() if line.startswith("usage: ")]
-    assert (len(helped), done.stdout.splitlines()[-1]) == (len(recipes), "[]"), done.stdout + done.stderr
+    assert (len(helped), done.stdout.splitlines()[-1]) == (len(LATE), "[]"), done.stdout + done.stderr
 
 
 # The command rt-torchrl: what it lists, what it runs, and the wheel that gives it.
-
-
-RECIPES = {path.stem for path in (ROOT / "recipes").glob("*.py")}
 
 
 def test_it_lists_every_recipe_with_its_purpose(monkeypatch, capsys):
@@ -248,17 +260,12 @@ def test_it_lists_every_recipe_with_its_purpose(monkeypatch, capsys):
     assert listed == RECIPES | {"FILE.py"} and "Arms of the algorithm on several systems" in bare
 
 
-def test_the_list_waits_for_no_library():
-    program = "import sys; from rt_torchrl.runs.console import main; main([]); print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "False"
-
-
 def test_an_unknown_recipe_is_refused_with_the_nearest():
     with pytest.raises(SystemExit, match="no recipe 'wind_turbin'; did you mean wind_turbine"):
         console.main(["wind_turbin"])
     with pytest.raises(SystemExit, match=r"mine\.py does not exist"):
         console.main(["mine.py"])
+    assert console.recipe("wind-turbine") == ROOT / "recipes" / "wind_turbine.py"  # names may have hyphens
 
 
 def test_it_runs_a_file_as_a_script(tmp_path, monkeypatch, capsys):
@@ -269,19 +276,6 @@ def test_it_runs_a_file_as_a_script(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", list(sys.argv))
     console.main([str(own), "--quick"])
     assert capsys.readouterr().out == "found ['--quick']\n"
-
-
-def test_names_may_have_hyphens():
-    assert console.recipe("wind-turbine") == ROOT / "recipes" / "wind_turbine.py"
-
-
-def test_the_wheel_holds_the_recipes_and_the_command(wheel):
-    archive = zipfile.ZipFile(wheel)
-    names = archive.namelist()
-    held = {Path(name).stem for name in names if name.startswith("rt_torchrl/recipes/") and name.count("/") == 2}
-    assert held == RECIPES
-    (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
-    assert "rt-torchrl = rt_torchrl.runs.console:main" in archive.read(entry_points).decode()
 
 
 @pytest.mark.nightly
@@ -345,8 +339,7 @@ for path in recipes:
 @pytest.mark.slow
 def test_the_first_episodes_load_only_what_they_use(tmp_path):
     recipes = [str(ROOT / "recipes" / f"{name}.py") for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
-    command = [sys.executable, "-c", FIRST_EPISODES, str(tmp_path), *recipes]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = python(FIRST_EPISODES, str(tmp_path), *recipes)
     said = [line for line in done.stdout.splitlines() if line.startswith("late: ")]
     assert said == ["late: []"] * 3, done.stdout + done.stderr
 
@@ -362,15 +355,13 @@ def test_every_recipe_says_that_it_starts_before_it_loads_pytorch():
         "        runpy.run_path(path, run_name='__main__')\n"
         "    print('ended', file=sys.stderr)"
     )
-    read = {"paper", "paper_figures"}  # their parts stand at the top, because they are read as much as run
-    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem not in read]
-    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
-    assert done.stderr.splitlines() == ["loading PyTorch and TorchRL", "ended"] * len(recipes), done.stderr
+    done = python(code, *LATE)
+    assert done.stderr.splitlines() == ["loading PyTorch and TorchRL", "ended"] * len(LATE), done.stderr
 
 
 @pytest.mark.parametrize("given, expected", [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
 def test_threads_of_a_program_wait_without_a_core_unless_its_user_says_otherwise(given, expected):
     code = "import os; from rt_torchrl import begin_loading; begin_loading(); print(os.environ['OMP_WAIT_POLICY'])"
     without = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=without | given, capture_output=True, text=True)
+    done = python(code, env=without | given)
     assert done.stdout.strip() == expected, done.stderr

@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import json
-import math
 import re
 
 import pytest
@@ -15,8 +14,6 @@ from test_export_recipe import leave_run, recipe
 from test_optimal_control import quadratic_program
 
 from rt_torchrl import load_run
-from rt_torchrl.atomic_file import write_results
-from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import LimitConfig, exact_optimum, fitting, flown_starts, resting_at_the_end
@@ -148,14 +145,6 @@ def test_a_run_has_its_own_cost_and_command(tmp_path):
     judged = episodes.judge(episodes.fly(OnOffValve(plant)))
     assert found["on-off"]["costs"] == judged.control_costs.tolist()
     assert min(map(mean, found.values())) == mean(found["clairvoyant"])
-
-
-def test_results_are_standard_json(tmp_path):
-    """Numbers that are not finite are null, and paths are text."""
-    content = {"config": BoundedDescentConfig(), "costs": (1.5, math.inf, math.nan), "folder": tmp_path, "none": None}
-    found = json.loads(write_results(tmp_path / "found.json", content).read_text(), parse_constant=pytest.fail)
-    assert found["costs"] == [1.5, None, None] and found["folder"] == str(tmp_path) and found["none"] is None
-    assert found["config"]["memory"] == BoundedDescentConfig().memory
 
 
 def test_the_least_commands_last_as_long_as_costs_least():

@@ -13,8 +13,8 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
-from small_runs import SMALL, small_run
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from small_runs import SMALL, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_algorithm import STEPS, twinning
 from test_export_recipe import RECIPES
@@ -38,16 +38,12 @@ from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
-def refused(name):
-    raise AssertionError(f"{name} is not JSON")
-
-
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
     nothing = {part: dataclasses.replace(getattr(SMALL, part), iterations=0) for part in ("assimilation", "planner")}
     twinning = dataclasses.replace(SMALL, **nothing)
     options = {"compiled": False, "unseen": 3, "figures": False, "untrained": 0, "episodes": 1}
     metrics = Run(RunConfig(log_dir=tmp_path, twinning=twinning, **options), LinearQuadratic(horizon=2.0)).train()
-    assert json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refused) == metrics
+    assert json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail) == metrics
     assert metrics["episodes"][0]["J_p"] is None and metrics["episodes"][0]["real_cost"] > 0.0
     assert "J_a model-based" in capsys.readouterr().out
 
@@ -62,8 +58,10 @@ def test_infinite_costs_are_dashes_in_the_table(tmp_path):
 
 
 def judged(seed):
-    """Two unseen episodes, whose mean costs depend on the draw."""
-    return UnseenEpisodes(LinearQuadratic(horizon=1.0, noise=0.5), 2, seed=seed)
+    """Two unseen episodes of a worn system, whose mean costs depend on the draw."""
+    unseen = UnseenEpisodes(LinearQuadratic(horizon=1.0, noise=0.5), 2, seed=seed)
+    unseen.closure = LinearClosure(torch.zeros(2, 2))
+    return unseen
 
 
 def test_the_better_policy_is_chosen_on_other_episodes_than_it_is_reported_on():
@@ -74,6 +72,7 @@ def test_the_better_policy_is_chosen_on_other_episodes_than_it_is_reported_on():
         unseen = judged(seed)
         other = unseen.validation()
         assert not torch.equal(other.initial_state, unseen.initial_state) and len(other.initial_state) == 2
+        assert other.closure is unseen.closure
         # Chosen alike for every seed of the unseen episodes, which play no part in it.
         assert results.better_of(algorithm, unseen) == (cheapest(policies, judged(2_000_000)), "validation episodes")
         differs += cheapest(policies, unseen) != cheapest(policies, other)
@@ -81,23 +80,7 @@ def test_the_better_policy_is_chosen_on_other_episodes_than_it_is_reported_on():
 
 
 def cheapest(policies, episodes):
-    """Without the library's rollout: the plant's step in a loop."""
-    plant, costs = episodes.plant, {}
-    for role, policy in policies.items():
-        s, total = episodes.initial_state, 0.0
-        for k in range(plant.n_steps):
-            t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
-            a = plant.actuate(s, policy(s))
-            total = total + plant.running_cost(t, s, a, z).mean()
-            s = plant.step(t, s, a, z, plant.closure).state
-        costs[role] = total
-    return min(costs, key=costs.get)
-
-
-def test_validation_follows_the_wear_of_the_system():
-    unseen = judged(0)
-    unseen.closure = torch.nn.Identity()
-    assert unseen.validation().closure is unseen.closure
+    return min(policies, key=lambda role: stepped_cost(episodes, policies[role]))
 
 
 def test_on_a_real_system_the_better_policy_is_the_live_one():
@@ -127,30 +110,30 @@ def test_clones_are_flown_once_and_other_policies_each():
 # The closure's weights on the terminal.
 
 
-def test_true_weights_are_shown_where_they_are_known():
-    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}}
-    bare = [["a", "1", "1.5"], ["b", "2", "2.5"]]
-    for unknown in ({}, {"true": None}, {"true": {"other": 1.0}}):
-        shown = [line.split() for line in closure_lines(closure | unknown)]
-        assert shown == [["closure", "weight", "start", "found"], *bare]
-    shown = [line.split() for line in closure_lines(closure | {"true": {"a": 1.25}})]
-    assert shown[0][-1] == "true" and [line[-1] for line in shown[1:]] == ["1.25", "-"]
+ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
 
 
-def test_units_and_meanings_are_shown_where_the_closure_states_them():
+@pytest.mark.parametrize(
+    ("known", "errors", "columns", "rows"),
+    [
+        ({}, None, "", ["a 1 1.5", "b 2 2.5"]),
+        ({"true": None}, None, "", ["a 1 1.5", "b 2 2.5"]),
+        ({"true": {"other": 1.0}}, None, "", ["a 1 1.5", "b 2 2.5"]),
+        ({"true": {"a": 1.25}}, None, " true", ["a 1 1.5 1.25", "b 2 2.5 -"]),
+        ({"true": {"a": 1.25}}, {"a": 0.25, "b": None}, " std. error true", ["a 1 1.5 0.25 1.25", "b 2 2.5 - -"]),
+        ({"described": ROD}, None, "", ["a [kg] 1 1.5 mass of the rod", "b 2 2.5"]),
+    ],
+)
+def test_weights_are_shown_with_what_is_known_of_them(known, errors, columns, rows):
+    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}} | known
+    shown = [" ".join(line.split()) for line in closure_lines(closure, errors=errors)]
+    assert shown == [f"closure weight start found{columns}", *rows]
+
+
+def test_units_and_meanings_are_those_that_the_closure_states():
     described = described_weights(UniformRod.guess(0.5))
-    closure = {"start": {"mass": 0.5, "length": 0.5}, "found": {"mass": 1.0, "length": 0.75}, "described": described}
-    shown = closure_lines(closure)
-    assert shown[1].split() == ["mass", "[kg]", "0.5", "1", "mass", "of", "the", "rod"]
-    assert shown[2].split() == ["length", "[m]", "0.5", "0.75", "length", "of", "the", "rod"]
+    assert described["mass"] == {"unit": "kg", "meaning": "mass of the rod"} and list(described) == ["mass", "length"]
     assert described_weights(torch.nn.Linear(1, 1)) == {}
-
-
-def test_standard_errors_stand_beside_the_weights():
-    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "true": {"a": 1.25, "b": 2.0}}
-    shown = [line.split() for line in closure_lines(closure, errors={"a": 0.25, "b": None})]
-    assert shown[1:] == [["a", "1", "1.5", "0.25", "1.25"], ["b", "2", "2.5", "-", "2"]]
-    assert shown[0] == ["closure", "weight", "start", "found", "std.", "error", "true"]
 
 
 # The bar of a training says what is under way.

@@ -3,14 +3,13 @@
 import dataclasses
 import json
 import math
-import shutil
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_runs import SMALL, small_run
+from small_runs import SMALL, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
@@ -64,51 +63,32 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
 
 
-def test_a_run_without_figures_has_the_same_results(tmp_path):
-    drawn = small_run(tmp_path / "drawn", episodes=1, figures=True).train()
-    bare = small_run(tmp_path / "bare", episodes=1, figures=False).train()
-    assert (tmp_path / "drawn" / "figures").exists()
-    assert not (tmp_path / "bare" / "figures").exists()
-    for metrics in (drawn, bare):
-        del metrics["summary"]["seconds"], metrics["episodes"][0]["seconds"]
-    assert bare == drawn
-
-
-def drawn_policies(plant, count):
-    generator = torch.Generator().manual_seed(UNSEEN_SEED)
-    return [plant.make_policy(generator) for _ in range(count)]
+def test_a_run_without_figures_and_random_starts_has_the_same_results(tmp_path, capsys):
+    whole = small_run(tmp_path / "whole", episodes=1, figures=True).train()
+    assert "over a random start's mean J_a" in capsys.readouterr().out
+    bare = small_run(tmp_path / "bare", episodes=1, untrained=0).train()
+    assert "random start" not in capsys.readouterr().out
+    assert [(tmp_path / name / "figures").exists() for name in ("whole", "bare")] == [True, False]
+    del whole["summary"]["unseen"]["J_a_untrained"]
+    compared = {key: value for key, value in whole["summary"].items() if "untrained" not in key}
+    assert len(compared) == len(whole["summary"]) - 2
+    assert_same({**whole, "summary": compared}, bare)
 
 
 def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     run = small_run(tmp_path)
     found = run.train()["summary"]
-    policy = run.algorithm.policies["model_based"]
-    plant, state, costs = run.unseen.plant, run.unseen.initial_state, {}
-    # Independent of the library's rollout: the plant's step in a loop.
-    for name, pi in (("before", run.initial_policies["model_based"]), ("after", policy)):
-        s, total = state, 0.0
-        for k in range(plant.n_steps):
-            t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
-            a = pi(s)
-            total = total + plant.running_cost(t, s, a, z) / plant.n_steps
-            s = plant.step(t, s, a, z, plant.closure).state
-        costs[name] = total.mean().item()
-    untrained = [run.unseen.control_costs(pi).mean().item() for pi in drawn_policies(plant, 20)]
+    before, after = (
+        stepped_cost(run.unseen, policies["model_based"]) for policies in (run.initial_policies, run.algorithm.policies)
+    )
+    generator = torch.Generator().manual_seed(UNSEEN_SEED)
+    drawn = [run.unseen.plant.make_policy(generator) for _ in range(20)]
+    untrained = [run.unseen.control_costs(policy).mean().item() for policy in drawn]
     assert found["unseen"]["J_a_untrained"]["mean"] == pytest.approx(sum(untrained) / 20, rel=1e-12)
     over = found["J_a_over_untrained_model_based"]
-    assert over == pytest.approx(costs["after"] / (sum(untrained) / 20), rel=1e-12)
+    assert over == pytest.approx(after / (sum(untrained) / 20), rel=1e-12)
     # Sums in another order: rounding only.
-    assert found["J_a_ratio_model_based"] == pytest.approx(costs["after"] / costs["before"], rel=1e-12)
-
-
-def test_a_run_without_random_starts_has_the_same_results(tmp_path, capsys):
-    compared = small_run(tmp_path / "compared", episodes=1).train()["summary"]
-    assert "over a random start's mean J_a" in capsys.readouterr().out
-    bare = small_run(tmp_path / "bare", episodes=1, untrained=0).train()["summary"]
-    assert "random start" not in capsys.readouterr().out
-    del compared["unseen"]["J_a_untrained"], compared["seconds"], bare["seconds"]
-    left = {key: value for key, value in compared.items() if "untrained" not in key}
-    assert left == bare and len(left) == len(compared) - 2
+    assert found["J_a_ratio_model_based"] == pytest.approx(after / before, rel=1e-12)
 
 
 def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
@@ -254,36 +234,10 @@ def interrupted_in(episode, monkeypatch):
     monkeypatch.setattr(MakePlan, "forward", interrupted)
 
 
-def test_an_interrupt_keeps_the_episodes_done(tmp_path, monkeypatch):
-    interrupted_in(2, monkeypatch)
-    metrics = small_run(tmp_path, episodes=5).train()
-    assert len(metrics["episodes"]) == 2
-    monkeypatch.undo()
-    # The half episode left no trace: the resumed run equals one that was never interrupted.
-    resumed = small_run(tmp_path, episodes=4, resume=True).train()
-    whole = small_run(tmp_path / "whole", episodes=4).train()
-    assert [e["J_p"] for e in resumed["episodes"]] == [e["J_p"] for e in whole["episodes"]]
-
-
 def test_quick_is_a_small_run(tmp_path):
     effective = RunConfig(quick=True, log_dir=tmp_path).effective()
     assert (effective.episodes, effective.unseen, effective.twinning.learner.critic_iterations) == (3, 5, 200)
     assert RunConfig(quick=True, episodes=2).effective().episodes == 2
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """The folder of a finished run; to be copied by who changes it."""
-    folder = tmp_path_factory.mktemp("finished")
-    small_run(folder, episodes=1).train()
-    return folder
-
-
-def test_a_taken_folder_is_refused(tmp_path, finished):
-    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
-    with pytest.raises(ValueError, match="holds a run already.*--resume.*--overwrite"):
-        small_run(tmp_path)
-    small_run(tmp_path, episodes=1, overwrite=True).train()
 
 
 def test_an_unwritable_folder_is_refused(tmp_path):
@@ -292,43 +246,31 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         small_run(tmp_path / "file" / "run")
 
 
-def test_a_checkpoint_of_another_plant_is_refused(finished):
+def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
+    small_run(tmp_path, episodes=1).train()
 
     class Other(LinearQuadratic):
         name = "other"
 
-    config = RunConfig(log_dir=finished, resume=True, compiled=False, twinning=SMALL)
+    config = RunConfig(log_dir=tmp_path, resume=True, twinning=SMALL)
     with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
         Run(config, Other(horizon=2.0))
-
-
-def test_a_checkpoint_of_another_architecture_is_refused(finished):
-    wider = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, critic_hidden=(9,)))
-    with pytest.raises(ValueError, match=r"critic_hidden is \[9\] here and was \[8\] in the run"):
-        Run(RunConfig(log_dir=finished, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"episodes": 0}, "episodes=0"),
         ({"unseen": 1}, "unseen=1"),
-        ({"threads": -1}, "threads=-1"),
         ({"resume": True}, "resume needs log_dir"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"seed": 2**63}, "seed=9223372036854775808 must be at most 9223372036854775806"),
-        ({"hidden": (8, 0)}, r"hidden\[1\]=0 must be at least 1"),
         ({"closure_hidden": (0,)}, r"closure_hidden\[0\]=0 must be at least 1"),
-        ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
         ({"model_free_policy": "x"}, "model_free_policy='x' does not exist; choose same, plant or mlp"),
-        ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
         (
             {"engine": "fast"},
             "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd",
         ),
-        ({"noise": -0.1}, "noise=-0.1 must be at least 0"),
         ({"noise": math.inf}, "noise=inf must be a finite number"),
-        ({"episodes": 2.5}, "episodes=2.5 must be a whole number"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
 )
@@ -387,9 +329,7 @@ def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
         return Collector(env, acting, frames_per_batch=plant.n_steps, total_frames=-1, reset_at_each_iter=True)
 
     def run(folder, **parts):
-        config = RunConfig(
-            episodes=3, log_dir=tmp_path / folder, compiled=False, unseen=3, figures=False, twinning=SMALL
-        )
+        config = RunConfig(episodes=3, log_dir=tmp_path / folder, unseen=3, figures=False, twinning=SMALL)
         return Run(config, LinearQuadratic(horizon=2.0), **parts).train()
 
     parts = {

@@ -14,16 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
-from small_runs import SMALL, small_run
+from small_runs import small_run
 from torch import nn
 
-from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.atomic_file import write_atomically, write_json, write_results
 from rt_torchrl.options import read_options
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import run_folder
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings, require_same
 from rt_torchrl.steps.plan import MakePlan
@@ -236,20 +233,14 @@ def same(one, other):
 
 
 def test_what_is_saved_is_read_back(tmp_path):
-    file = tmp_path / "weights.pt"
-    save_tensors(file, CONTENT)
-    assert same(load_tensors(file), CONTENT)
-    # As anybody reads it.
-    assert same(torch.load(file, weights_only=True), CONTENT)
+    """Also by torch alone; weights and numbers of other kinds become plain ones."""
+    file, module = tmp_path / "weights.pt", nn.Linear(2, 3)
+    others = {"module": module.state_dict(), "number": np.float64(0.1), "size": torch.Size([2])}
+    save_tensors(file, CONTENT | others)
+    expected = CONTENT | {"module": dict(module.state_dict()), "number": 0.1, "size": (2,)}
+    for found in (load_tensors(file), torch.load(file, weights_only=True)):
+        assert same(found, expected) and type(found["module"]) is dict and type(found["number"]) is float
     assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"]
-
-
-def test_weights_and_numbers_of_other_kinds_are_saved_as_plain_ones(tmp_path):
-    module, file = nn.Linear(2, 3), tmp_path / "weights.pt"
-    save_tensors(file, {"module": module.state_dict(), "number": np.float64(0.1), "size": torch.Size([2])})
-    found = load_tensors(file)
-    assert type(found["module"]) is dict and type(found["number"]) is float and found["size"] == (2,)
-    torch.testing.assert_close(found["module"], dict(module.state_dict()), rtol=0, atol=0)
 
 
 def test_what_could_not_be_read_back_is_not_saved(tmp_path):
@@ -278,16 +269,6 @@ def test_a_file_runs_no_code(tmp_path, legacy):
     with pytest.raises(ValueError, match="checkpoint.pt is (not loaded|damaged, or no file of a run)"):
         load_tensors(file)
     assert not trace.exists()
-
-
-def test_every_truncation_is_noticed(tmp_path):
-    file = tmp_path / "weights.pt"
-    save_tensors(file, CONTENT)
-    whole = file.read_bytes()
-    for length in [*range(0, len(whole), 37), len(whole) - 1]:
-        file.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"weights\.pt is (damaged|not loaded)"):
-            load_tensors(file)
 
 
 def test_a_changed_bit_is_noticed_or_without_effect(tmp_path):
@@ -327,12 +308,15 @@ def test_torch_reads_no_field_that_python_does_not_check(tmp_path):
     assert same(load_tensors(file), CONTENT)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x00" * 100, b"PK\x03\x04", b"{}", os.urandom(5000)])
-def test_a_foreign_file_is_refused_by_name(tmp_path, content):
+def test_a_foreign_or_torn_file_is_refused_by_name(tmp_path):
     file = tmp_path / "checkpoint.pt"
-    file.write_bytes(content)
-    with pytest.raises(ValueError, match="checkpoint.pt is damaged, or no file of a run"):
-        load_tensors(file)
+    save_tensors(file, CONTENT)
+    whole = file.read_bytes()
+    torn = [whole[:length] for length in (*range(0, len(whole), 37), len(whole) - 1)]
+    for content in (b"\x00" * 100, b"PK\x03\x04", b"{}", os.urandom(5000), *torn):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match="checkpoint.pt is damaged, or no file of a run"):
+            load_tensors(file)
     torch.save([1, 2], file)
     with pytest.raises(ValueError, match="checkpoint.pt is no file of a run: it holds a list"):
         load_tensors(file)
@@ -367,43 +351,38 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
-def test_a_write_into_a_missing_folder_says_so(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing is written; make its folder.*gone/metrics\.json") as error:
-        write_json(tmp_path / "gone" / "metrics.json", {})
-    assert "intact" not in str(error.value) and "room" not in str(error.value)
-
-
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
-def test_a_write_without_permission_says_so(number, tmp_path, monkeypatch):
-    def refused(*_, **__):
+def opening_fails(number):
+    def fail(*_, **__):
         raise OSError(number, os.strerror(number))
 
-    (tmp_path / "metrics.json").write_text("old")
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "open", refused)
-        with pytest.raises(
-            OSError, match=r"what was there before is intact; write where you may.*metrics\.json"
-        ) as error:
-            write_json(tmp_path / "metrics.json", {})
-    assert "room" not in str(error.value) and (tmp_path / "metrics.json").read_text() == "old"
+    return Path, "open", fail
 
 
-def test_an_error_after_the_new_content_does_not_speak_of_the_old_one(tmp_path, monkeypatch):
-    """The folder cannot be flushed, so that only a power cut would bring the old content back."""
-    flush = os.fsync
+def no_folder_flushed(descriptor):
+    if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    def failing(descriptor):
-        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        flush(descriptor)
 
+@pytest.mark.parametrize(
+    ("old", "patch", "said", "left"),
+    [
+        (None, opening_fails(errno.ENOENT), "nothing is written; make its folder", None),
+        ("old", opening_fails(errno.EACCES), "what was there before is intact; write where you may", "old"),
+        ("old", opening_fails(errno.EROFS), "what was there before is intact; write where you may", "old"),
+        # Only a power cut would bring the old content back.
+        ("old", (os, "fsync", no_folder_flushed), "the file is written, but a power cut may undo it", "{}\n"),
+    ],
+)
+def test_a_write_that_fails_says_what_is_there_now(old, patch, said, left, tmp_path, monkeypatch):
     file = tmp_path / "metrics.json"
-    file.write_text("old")
+    if old is not None:
+        file.write_text(old)
     with monkeypatch.context() as patched:
-        patched.setattr(os, "fsync", failing)
-        with pytest.raises(OSError, match=r"is written, but a power cut may undo it.*metrics\.json") as error:
-            write_json(file, {"new": 1})
-    assert "intact" not in str(error.value) and json.loads(file.read_text()) == {"new": 1}
+        patched.setattr(*patch)
+        with pytest.raises(OSError, match=rf"{said}.*metrics\.json") as error:
+            write_json(file, {})
+    assert "room" not in str(error.value) and ("intact" in str(error.value)) == (left == "old")
+    assert (file.read_text() if file.exists() else None) == left
 
 
 def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
@@ -422,16 +401,15 @@ def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
 
 
 def test_numbers_that_json_does_not_have_are_null(tmp_path):
-    file, found = tmp_path / "metrics.json", {"a": [float("inf"), 1.0], "b": {"c": float("nan"), "d": "NaN"}}
+    """Paths are text then, and dataclasses objects."""
+    file, found = tmp_path / "metrics.json", {"a": (float("inf"), 1.0), "b": {"c": float("nan"), "d": "NaN"}}
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(file, found)
     assert not list(tmp_path.iterdir())
-    write_json(file, finite(found))
-
-    def refused(name):
-        raise AssertionError(f"{name} is not JSON")
-
-    assert json.loads(file.read_text(), parse_constant=refused) == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}}
+    content = found | {"config": EarlyStopping(patience=3), "folder": tmp_path}
+    read = json.loads(write_results(file, content).read_text(), parse_constant=pytest.fail)
+    config = {"patience": 3, "least_gain": 0.01}
+    assert read == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "config": config, "folder": str(tmp_path)}
 
 
 # Checkpoints: what they hold, what a damaged one does, and a run that has none yet.
@@ -454,20 +432,6 @@ def test_a_checkpoint_holds_tensors_in_plain_containers(folder):
     assert (
         found["state"]["algorithm"]["module.learn._extra_state"]["learner"]["memory"]["count"] == 40
     )  # two episodes of 20 transitions, none of the 460 free places
-
-
-def test_the_memory_samples_the_same_after_it_was_restored(folder, tmp_path):
-    runs = [small_run(tmp_path / name, episodes=2, **QUICK) for name in ("one", "other")]
-    for run in runs:
-        run_folder.load_checkpoint(folder / "checkpoint.pt", run.algorithm)
-    one, other = (run.algorithm.learner.memory for run in runs)
-    assert len(one) == len(other) == 40
-    for _ in range(3):
-        batches = [memory.sample(16) for memory in (one, other)]
-        for key in batches[0].keys(True, True):
-            assert torch.equal(batches[0][key], batches[1][key])
-        for memory, batch in zip((one, other), batches, strict=True):
-            memory.refresh(batch["index"], batch["next", "reward"].squeeze(-1))
 
 
 def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_path):
@@ -521,59 +485,28 @@ def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
     assert len(run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)) == 2
 
 
-@pytest.mark.parametrize(
-    ("step", "part"),
-    [
-        ("learn", "learner"),
-        ("interact", "short_term"),
-        ("inputs", "virtual"),
-        ("switch", "referee"),
-        ("interact", "env"),
-    ],
-)
-def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, step, part):
-    found = load_tensors(folder / "checkpoint.pt")
-    del found["state"]["algorithm"][f"module.{step}._extra_state"][part]
-    save_tensors(tmp_path / "checkpoint.pt", found)
-    algorithm = small_run(tmp_path / "run", **QUICK).algorithm
-    with pytest.raises(ValueError, match=f"weights do not fit this training.*{part}"):
-        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)
+PARTS = [
+    *(("learn", "learner"), ("interact", "short_term"), ("inputs", "virtual"), ("switch", "referee")),
+    ("interact", "env"),
+]
 
 
-def test_a_checkpoint_without_a_policy_does_not_fit(folder, tmp_path):
-    found = load_tensors(folder / "checkpoint.pt")
+def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, tmp_path):
+    algorithm, file = small_run(tmp_path / "run", **QUICK).algorithm, tmp_path / "checkpoint.pt"
+
+    def refused(changed, message):
+        save_tensors(file, changed)
+        with pytest.raises(ValueError, match=message):
+            run_folder.load_checkpoint(file, algorithm)
+
+    for step, part in PARTS:
+        found = load_tensors(folder / file.name)
+        del found["state"]["algorithm"][f"module.{step}._extra_state"][part]
+        refused(found, f"weights do not fit this training.*{part}")
+    found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
-    save_tensors(tmp_path / "checkpoint.pt", found)
-    with pytest.raises(ValueError, match=r"(?s)weights do not fit this training.*policies.*model_free\.gain"):
-        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
-
-
-def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
-    save_tensors(tmp_path / "checkpoint.pt", load_tensors(folder / "checkpoint.pt") | {"format": 2})
-    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 5"):
-        run_folder.load_checkpoint(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
-
-
-def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
-    """The plant's arguments are not options of the run, so only the weights show them."""
-    small_run(tmp_path, episodes=1, model_free_policy="mlp", hidden=(4,), **QUICK).train()
-    config = json.loads((tmp_path / "config.json").read_text())
-
-    class Observant(LinearQuadratic):
-        observations = (*LinearQuadratic.observations, Signal(symbol="e", name="again", unit="m"))
-
-        def observe(self, t, state, exogenous):
-            return torch.cat([state, state[..., :1]], -1)
-
-        def make_policy(self, generator):
-            policy = super().make_policy(generator)
-            policy.gain = torch.nn.Parameter(torch.zeros(1, 3, dtype=torch.float64))
-            return policy
-
-    options = {"compiled": False, "unseen": 3, "twinning": SMALL, "model_free_policy": "mlp", "hidden": (4,)}
-    with pytest.raises(ValueError, match="weights do not fit"):
-        Run(RunConfig(log_dir=tmp_path, resume=True, **options), Observant(horizon=2.0))
-    assert json.loads((tmp_path / "config.json").read_text()) == config
+    refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
+    refused(found | {"format": 2}, "checkpoint.pt has checkpoint format 2; this version reads format 5")
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
@@ -592,10 +525,3 @@ def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkey
     for record in (*resumed["episodes"], *whole["episodes"]):
         record["seconds"] = None
     assert resumed["episodes"] == whole["episodes"]
-
-
-def test_a_run_with_a_second_training_in_its_folder_is_refused(tmp_path):
-    first = small_run(tmp_path, episodes=1, **QUICK)
-    assert first.folder == tmp_path
-    with pytest.raises(ValueError, match="is in use by another training"):
-        small_run(tmp_path, episodes=1, overwrite=True, **QUICK)

@@ -332,9 +332,15 @@ def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatc
     assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]
 
 
+def broken_recipe(folder, statement):
+    """The tiny recipe with a statement before its run."""
+    file = folder / "broken.py"
+    file.write_text(TINY.read_text().replace("    Run(config", f"    {statement}\n    Run(config"))
+    return file
+
+
 def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
-    broken = tmp_path / "broken.py"
-    broken.write_text(TINY.read_text().replace("    Run(config", "    if config.seed:\n        1 / 0\n    Run(config"))
+    broken = broken_recipe(tmp_path, "if config.seed:\n        1 / 0")
     with pytest.raises(ValueError, match=r"1 failed, the others are kept:\n.*seed-1: ZeroDivisionError: division"):
         study.main(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
     assert "| twinning | 1 |" in capsys.readouterr().out
@@ -343,8 +349,7 @@ def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
 
 
 def test_a_failure_is_told_also_where_no_results_can_be_written(tmp_path, capsys, monkeypatch):
-    broken = tmp_path / "broken.py"
-    broken.write_text(TINY.read_text().replace("    Run(config", "    1 / 0\n    Run(config"))
+    broken = broken_recipe(tmp_path, "1 / 0")
 
     def full(*parts):
         raise OSError("no space left")
