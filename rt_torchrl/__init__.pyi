@@ -77,7 +77,6 @@ from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
 from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
-from .interruption import require_finished
 from .loading import begin_loading
 from .options import configuration
 from .runs.compare import Comparison, compare_runs
@@ -236,7 +235,6 @@ __all__ = [
     "main_of",
     "read_log",
     "require_device",
-    "require_finished",
     "require_request",
     "require_stable_step",
     "rk4_step",

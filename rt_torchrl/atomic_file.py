@@ -83,12 +83,16 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def finite(content: Any) -> Any:
-    """The content with None in place of every number that is not finite."""
+    """The content as JSON has it: None for every number that is not finite, text for paths, objects for dataclasses."""
+    if dataclasses.is_dataclass(content) and not isinstance(content, type):
+        return finite(dataclasses.asdict(content))
     if isinstance(content, float):
         return content if math.isfinite(content) else None
     if isinstance(content, dict):
         return {key: finite(value) for key, value in content.items()}
-    return [finite(value) for value in content] if isinstance(content, list | tuple) else content
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return str(content) if isinstance(content, Path) else content
 
 
 def make_folder(option: str, folder: Path) -> None:
@@ -131,20 +135,10 @@ def new_folder(parent: Path, ending: str = "") -> Path:
 
 
 def write_results(path: Path, content: dict[str, Any]) -> Path:
-    """Write results with null for every number that is not finite, and text for paths; return the path.
+    """Write what :func:`finite` makes of results, and return the path.
 
     Raises:
         OSError: if the file cannot be written; its old content stays.
     """
-    write_json(path, finite(_plain(content)))
+    write_json(path, finite(content))
     return path
-
-
-def _plain(content: Any) -> Any:
-    if dataclasses.is_dataclass(content) and not isinstance(content, type):
-        return _plain(dataclasses.asdict(content))
-    if isinstance(content, dict):
-        return {key: _plain(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_plain(value) for value in content]
-    return str(content) if isinstance(content, Path) else content

@@ -80,17 +80,3 @@ def safe_point() -> None:
 
 class Interrupted(SystemExit):
     """The end of a program, in words, whose training Ctrl-C or SIGTERM has stopped; no other training must follow."""
-
-
-def require_finished(done: int, asked: int) -> None:
-    """End the program after a training that Ctrl-C or SIGTERM has stopped, where other trainings would follow.
-
-    Args:
-        done: number of episodes done.
-        asked: number of episodes asked for.
-
-    Raises:
-        SystemExit: if fewer episodes are done.
-    """
-    if done < asked:
-        raise Interrupted(f"interrupted after {done} of {asked} episodes of a training; those after it are left")

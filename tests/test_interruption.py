@@ -11,7 +11,7 @@ import time
 import pytest
 from small_runs import small_run
 
-from rt_torchrl.interruption import Interruption, require_finished, safe_point
+from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.steps.learn import ActorCritic
 
 EPISODES = 4
@@ -47,16 +47,6 @@ def test_a_first_press_waits_for_a_safe_point_and_a_second_does_not():
         assert interruption.at_once
     safe_point()  # forgotten
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_trainings_after_an_interrupted_one_are_left(tmp_path):
-    run = small_run(tmp_path, EPISODES, untrained=0)
-    run.callbacks.append(lambda episodes: press())
-    done = run.train()["episodes"]
-    assert len(done) == 1
-    with pytest.raises(SystemExit, match=f"1 of {EPISODES} episodes"):
-        require_finished(len(done), EPISODES)
-    require_finished(EPISODES, EPISODES)
 
 
 def test_a_handler_of_somebody_else_stays(capfd):

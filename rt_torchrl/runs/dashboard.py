@@ -88,7 +88,8 @@ class Dashboard:
         self._writer, self._loggers = SummaryWriter(str(folder)), loggers
         self._writer.add_custom_scalars({"cost": {"all costs": ["Multiline", COSTS]}})
 
-    def _scalar(self, tag: str, value: float, step: int) -> None:
+    def scalar(self, tag: str, value: float, step: int = 0) -> None:
+        """Write a scalar of an episode, or one of the run as a whole."""
         self._writer.add_scalar(tag, value, step)
         name = REFUSED.sub("", tag)
         for logger in self._loggers:
@@ -109,7 +110,7 @@ class Dashboard:
         """
         final = {f"final/{name}": value for name, value in final_costs(summary).items()}
         for tag, value in final.items():
-            self._scalar(tag, value, 0)
+            self.scalar(tag, value)
         shown = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in options.items()}
         for part in hparams(shown, final):
             self._writer._get_file_writer().add_summary(part)
@@ -132,28 +133,28 @@ class Dashboard:
         step, live = record["episode"], record["live"].replace("_", "-")
         for key, tag in TAGS.items():
             if key in record:
-                self._scalar(tag, record[key], step)
-        self._scalar(f"cost/real episode ({live})", record["real_cost"], step)
+                self.scalar(tag, record[key], step)
+        self.scalar(f"cost/real episode ({live})", record["real_cost"], step)
         for key in OVER_THE_FIRST:
             if key in record and first.get(key) and np.isfinite(first[key]):
-                self._scalar(f"cost over the first/{TAGS[key].split('/')[1]}", record[key] / first[key], step)
+                self.scalar(f"cost over the first/{TAGS[key].split('/')[1]}", record[key] / first[key], step)
         self._weights(record, policies)
-        self._scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
+        self.scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
         for event in ("swap", "clone"):
-            self._scalar(f"switch/{event}", float(record.get("event") == event), step)
+            self.scalar(f"switch/{event}", float(record.get("event") == event), step)
         self._texts(record)
         for key, value in record.items():
             for prefix in (prefix for prefix in GROUPS if key.startswith(prefix)):
-                self._scalar(key.replace(prefix, GROUPS[prefix]), value, step)
+                self.scalar(key.replace(prefix, GROUPS[prefix]), value, step)
         for name, seconds in record["seconds"].items():
-            self._scalar(f"seconds/{name}", seconds, step)
+            self.scalar(f"seconds/{name}", seconds, step)
 
     def _weights(self, record: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
         """Write the closure's coefficients, or the weights of a perceptron, and those of both policies."""
         step = record["episode"]
         for name, weight in (record["closure"] or {}).items():
             if isinstance(weight, float):
-                self._scalar(f"closure/{name}", weight, step)
+                self.scalar(f"closure/{name}", weight, step)
             else:
                 self._writer.add_histogram(f"closure/{name}", np.ravel(weight), step)
         for role, policy in policies.items():
@@ -176,10 +177,6 @@ class Dashboard:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""
         for name, image in images.items():
             self._writer.add_image(name, image, step, dataformats="HWC")
-
-    def scalar(self, tag: str, value: float) -> None:
-        """Write a scalar of the run as a whole."""
-        self._scalar(tag, value, 0)
 
     def close(self) -> None:
         self._writer.close()

@@ -125,20 +125,14 @@ def learner_threads(config: RunConfig) -> int:
     return min(torch.get_num_threads(), max(1, (os.cpu_count() or 1) - 1))
 
 
-def acting_by_name(policies: Mapping[Role, nn.Module], first: Start | None) -> dict[str, nn.Module]:
-    """Everything that may act in a run: the policies by role, and what the training begins with."""
-    found: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
-    teacher = None if first is None else first.teacher
-    return found if teacher is None else found | {FIRST: teacher}
-
-
 def operation_of(
     config: RunConfig,
     env: EnvBase,
     make_env: Callable[[], EnvBase] | None,
     plant: Plant,
-    policies: dict[str, nn.Module],
+    policies: Mapping[Role, nn.Module],
     *,
+    first: Start | None = None,
     folder: Path,
 ) -> Operation:
     """The operation of a run.
@@ -148,7 +142,8 @@ def operation_of(
         env: the real system.
         make_env: function that makes the real system in another process; None if there is none.
         plant: physics of the twin.
-        policies: everything that may act, by name.
+        policies: both policies by role.
+        first: what the training begins with, whose teacher may act, too.
         folder: run folder, for the log of the events.
 
     Raises:
@@ -161,10 +156,13 @@ def operation_of(
             "--asynchronous."
         )
     options = config.operation
+    acting: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
+    if first is not None and first.teacher is not None:
+        acting[FIRST] = first.teacher
     crew = Crew(
         make_env or (lambda: env),
         plant,
-        policies,
+        acting,
         config.twinning.exploration,
         options,
         seed=episode_seed(config.seed, NOISE),

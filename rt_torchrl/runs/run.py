@@ -28,7 +28,6 @@ from rt_torchrl.runs.dashboard import Dashboard, Progress, make_loggers
 from rt_torchrl.runs.real_side import (
     EVENTS,
     RealFlights,
-    acting_by_name,
     end_operation,
     judged_on,
     learner_threads,
@@ -56,49 +55,6 @@ if TYPE_CHECKING:
 
 
 PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
-
-
-class Drawing:
-    """Draws the figures of a run, each once.
-
-    Args:
-        plant_figures: function that draws the figures that only this plant has.
-        animate: function that writes an animation of the last real episode to a path.
-    """
-
-    def __init__(self, plant_figures: PlantFigures, animate: Callable[[Snapshot, Path], None] | None):
-        self.plant_figures, self.animate = plant_figures, animate
-
-    def drawn(self, snapshot: Snapshot) -> dict[str, "Figure"]:
-        """The figures of a training."""
-        return figures.figures_of(snapshot) | self.plant_figures(snapshot)
-
-    def images(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
-        """Pixels of the figures of a training, by name."""
-        return {name: figures.pixels(figure) for name, figure in self.drawn(snapshot).items()}
-
-    def save(
-        self, snapshot: Snapshot, folder: Path, *, first: Mapping[str, "Figure"], last: Mapping[str, "Figure"]
-    ) -> dict[str, np.ndarray]:
-        """Write the figures and the animation at the end of a run.
-
-        Args:
-            snapshot: the training at its end.
-            folder: folder of the figures.
-            first: figures before those of the training, by name.
-            last: figures after them.
-
-        Returns:
-            Pixels of all figures.
-        """
-        folder.mkdir(exist_ok=True)
-        drawn = {**first, **self.drawn(snapshot), **last}
-        images = {name: figures.pixels(figure) for name, figure in drawn.items()}
-        for name, image in images.items():
-            figures.save_pixels(image, folder / f"{name}.png")
-        if self.animate:
-            self.animate(snapshot, folder / "animation.gif")
-        return images
 
 
 def first_flights(unseen: UnseenEpisodes, live: Role, flights: Mapping[str, Trajectory]) -> dict[str, "Figure"]:
@@ -173,7 +129,7 @@ class Run:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
-        self.drawing = Drawing(plant_figures, animate)
+        self.plant_figures, self.animate = plant_figures, animate
         self.ended: str | None = None
         stopping = self.config.stopping()
         self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
@@ -232,11 +188,12 @@ class Run:
         closure = config.make_closure(physics, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
-        acting = acting_by_name(policies, first)
         table, twin = config.twinning, twin_of(config, physics, closure, first, compiled=compiled)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         self.algorithm = ReinforcementTwinning(
-            operation_of(config, env, make_env, physics, acting, folder=self.folder) if config.asynchronous else env,
+            operation_of(config, env, make_env, physics, policies, first=first, folder=self.folder)
+            if config.asynchronous
+            else env,
             twin,
             model_free=policies["model_free"],
             model_based=policies["model_based"],
@@ -318,7 +275,13 @@ class Run:
                 flown = first_flights(self.unseen, self.algorithm.referee.live, flights)
                 where = "on the twin" if self.unseen.judged_on == "twin" else ""
                 unseen = {"unseen": figures.unseen(judged, self.unseen.categories(), where=where)}
-                images = self.drawing.save(self._snapshot(), self.folder / "figures", first=flown, last=unseen)
+                snapshot, folder = self._snapshot(), self.folder / "figures"
+                images = self._pixels(snapshot, flown | unseen)
+                folder.mkdir(exist_ok=True)
+                for name, image in images.items():
+                    figures.save_pixels(image, folder / f"{name}.png")
+                if self.animate:
+                    self.animate(snapshot, folder / "animation.gif")
                 dashboard.images(images, len(self.episodes) - 1)
         table = results_table(metrics)
         dashboard.results(options, metrics["summary"], table)
@@ -370,7 +333,7 @@ class Run:
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             safe_point()
-            dashboard.images(self.drawing.images(self._snapshot()), len(self.episodes) - 1)
+            dashboard.images(self._pixels(self._snapshot(), {}), len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""
@@ -439,6 +402,11 @@ class Run:
             costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
             J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
         return real_side.entries(real, J_p)
+
+    def _pixels(self, snapshot: Snapshot, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
+        """Pixels of the figures of the training and of others, by name; each is drawn once."""
+        drawn = {**figures.figures_of(snapshot), **self.plant_figures(snapshot), **others}
+        return {name: figures.pixels(figure) for name, figure in drawn.items()}
 
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)

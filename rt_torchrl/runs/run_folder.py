@@ -164,31 +164,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 ANEW = "To train anew in this folder, use --overwrite."
 
 
-def state_of(algorithm: "ReinforcementTwinning") -> dict[str, Any]:
-    """Everything that the next episode depends on: tensors, numbers and strings in dicts, lists and tuples."""
-    return {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()}
-
-
-def restore(algorithm: "ReinforcementTwinning", state: dict[str, Any]) -> None:
-    """Put an algorithm that was built with the same configuration into a saved state.
-
-    Raises:
-        ValueError: if the state belongs to another plant, or does not fit.
-    """
-    name = algorithm.twin.plant.name
-    if state.get("plant") != name:
-        raise ValueError(
-            f"the checkpoint is of plant {state.get('plant')!r}, this training of {name!r}; use its recipe."
-        )
-    try:
-        algorithm.load_state_dict(state["algorithm"])
-    except (KeyError, ValueError) as error:
-        raise ValueError(
-            f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
-            f"with (see its config.json). {type(error).__name__}: {error}"
-        ) from error
-
-
 def save_checkpoint(
     path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]], *, kept: int = 1
 ) -> str | None:
@@ -207,7 +182,11 @@ def save_checkpoint(
         ValueError: if a component's state, such as an environment's, holds more than tensors, numbers and strings.
         OSError: if the checkpoint cannot be written.
     """
-    content = {"format": FORMAT, "episodes": episodes, "state": state_of(algorithm)}
+    content = {
+        "format": FORMAT,
+        "episodes": episodes,
+        "state": {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()},
+    }
     if kept > 1 and path.is_file():
         _keep(path, len(episodes) - 1)
     try:
@@ -278,9 +257,21 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _restore(file: Path, found: dict[str, Any], algorithm: "ReinforcementTwinning") -> None:
+    """Put an algorithm that was built with the same configuration into the state of a checkpoint."""
     if found["format"] != FORMAT:
         raise ValueError(f"{file} has checkpoint format {found['format']}; this version reads format {FORMAT}.")
-    restore(algorithm, found["state"])
+    name, state = algorithm.twin.plant.name, found["state"]
+    if state.get("plant") != name:
+        raise ValueError(
+            f"the checkpoint is of plant {state.get('plant')!r}, this training of {name!r}; use its recipe."
+        )
+    try:
+        algorithm.load_state_dict(state["algorithm"])
+    except (KeyError, ValueError) as error:
+        raise ValueError(
+            f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
+            f"with (see its config.json). {type(error).__name__}: {error}"
+        ) from error
 
 
 def _set_aside(damaged: dict[Path, DamagedFileError], sound: Path, episodes: int) -> None:
@@ -382,15 +373,13 @@ class RunFolder:
         self._lock.release(force=True)
 
     def _require_own(self) -> None:
-        config, path = self._config, self.path
-        if config.resume:
-            self._require_resumable()
-        elif not config.overwrite and any((path / name).exists() for name in WRITTEN):
-            raise ValueError(
-                f"log_dir={path} holds a run already; choose another folder, or --resume it, or --overwrite it."
-            )
-
-    def _require_resumable(self) -> None:
+        if not self._config.resume:
+            if not self._config.overwrite and any((self.path / name).exists() for name in WRITTEN):
+                raise ValueError(
+                    f"log_dir={self.path} holds a run already; choose another folder, or --resume it, or --overwrite "
+                    "it."
+                )
+            return
         if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         require_same(self.path, self._config)

@@ -24,7 +24,7 @@ from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
+from rt_torchrl.trajectories.trajectory import pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 SHORTEST = 10
@@ -163,14 +163,9 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
 
     def start(physics: Plant, closure: nn.Module) -> RecordedFlights:
         device = _device_of(physics, closure)
-        return RecordedFlights(physics, [on(device, record) for record in records])
+        return RecordedFlights(physics, [record.mapped(lambda part: part.to(device)) for record in records])
 
     return start
-
-
-def on(device: torch.device, record: Trajectory) -> Trajectory:
-    """The record on a device."""
-    return record.mapped(lambda part: part.to(device))
 
 
 def _device_of(*modules: nn.Module) -> torch.device:
