@@ -116,13 +116,8 @@ def test_the_first_action_is_never_late():
     assert [solve.late for solve in controller.solves] == [True] and controller.report()["late_solves"] == 1.0
     on_the_real_system(controller, PlantEnv(PLANT, seed=4))
     assert controller.report()["late_solves"] == PLANT.n_steps
-    assert not any(solve.late for solve in control().solves)
-
-
-def test_the_deadline_does_not_reach_simulated_episodes():
-    state, exogenous = episodes()
-    late, early = control(deadline=1e-9).fly(state, exogenous), control().fly(state, exogenous)
-    assert torch.equal(late.actions, early.actions)
+    # Simulated episodes know no wall clock.
+    assert torch.equal(controller.fly(state, exogenous).actions, control().fly(state, exogenous).actions)
 
 
 class Fragile(LinearQuadratic):

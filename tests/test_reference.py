@@ -64,16 +64,20 @@ def test_a_run_states_the_limit_beside_the_optimum_of_its_class(tmp_path, config
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("config", "options", "message"),
     [
-        ({"limit_episodes": -1}, "limit_episodes=-1 must be at least 0"),
-        ({"limit_episodes": 1}, "limit_episodes=1 must be 0, or at least 2"),
-        ({"reference": True, "device": "cuda"}, "limit on the CPU alone, and device='cuda'"),
+        (Known, {"limit_episodes": -1}, "limit_episodes=-1 must be at least 0"),
+        (Known, {"limit_episodes": 1}, "limit_episodes=1 must be 0, or at least 2"),
+        (Known, {"reference": True, "device": "cuda"}, "limit on the CPU alone, and device='cuda'"),
+        *(
+            (recipe("limit").Config, {name: value}, f"{name}={value}")
+            for name, value in {"episodes": 1, "seed": -1, "hold": -1, "mpc_horizon": -1.0}.items()
+        ),
     ],
 )
-def test_impossible_options_are_refused(options, message):
+def test_impossible_options_are_refused(config, options, message):
     with pytest.raises(ValueError, match=message):
-        Known(**options)
+        config(**options)
 
 
 @pytest.mark.parametrize(("horizon", "expected"), [(20.0, 8.0), (5.3, 5.0), (1.0, 1.0)])
@@ -168,10 +172,3 @@ def test_the_printed_example_runs(capsys):
     exec(compile(code, "docs/optimal_control.md", "exec"), {})
     first, second = ast.literal_eval(re.search(r"tensor\((\[.*?\])", capsys.readouterr().out).group(1))
     assert 0.0 < first < 0.1 and 0.0 < second < 0.1
-
-
-@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": -1}, {"mpc_horizon": -1.0}])
-def test_impossible_options_of_the_recipe_are_refused(option):
-    ((name, value),) = option.items()
-    with pytest.raises(ValueError, match=f"{name}={value}"):
-        recipe("limit").Config(**option)
