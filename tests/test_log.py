@@ -59,6 +59,7 @@ def test_columns_are_converted_by_their_units(tmp_path):
     assert log.times.tolist() == pytest.approx([0.0, 0.1, 0.25])
     assert log.columns["position"].tolist() == pytest.approx([1.0, 2.0, 3.0])
     assert log.columns["velocity"].tolist() == pytest.approx([0.1 / 3.6, 0.2 / 3.6, 0.3 / 3.6])
+    assert read_log(tmp_path / "log.csv", PLANT, MAPPING).columns["position"].tolist() == [3.0, 4.0, 5.0]
     with pytest.raises(ValueError, match=r"column 'x_mm' of .* for signal 'position': 'kg' .* and 'm' .*"):
         read_log(tmp_path / "log.csv", PLANT, [columns[0], Column.parse("x_mm=position[kg]")])
 

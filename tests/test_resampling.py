@@ -146,7 +146,7 @@ def test_samples_between_rows_that_are_too_far_apart_are_missing():
     log = log_of(plant, ["air"], rows=30)
     times = log.times + np.where(np.arange(30) % 2 == 1, 60.0, 0.0)
     air = 20.0 + 1e-3 * times
-    air[10:14] = np.nan  # rows 9 and 14: 1 440 s and more
+    air[10:13] = np.nan  # rows 9 and 13 are 1 200 s apart, and that of row 13 lies 60 s before it
     log = checked(SensorLog(times=times, columns=log.columns | {"air": air}), plant, missing=True)
     whole = filled(log, plant, {"wall": 11.0})
     parts = resample(whole, plant)
