@@ -256,8 +256,14 @@ def test_model_predictive_control_flies_first(tmp_path):
     assert report["start_cost_ratio_model_free"] < 1.1
 
 
+class Ending(LinearQuadratic):
+    def terminal_cost(self, state):
+        return 0.5 * state[..., 0] ** 2
+
+
 def test_transitions_of_a_record_are_those_of_a_flight():
-    plant = LinearQuadratic(horizon=2.0)
+    """Its end costs what the end of an episode does; a part of it has no such end."""
+    plant = Ending(horizon=2.0)
     env = PlantEnv(plant, seed=0)
     episode = env.rollout(plant.n_steps)[0]
     states = torch.cat([episode["state"], episode["next", "state"][-1:]])
@@ -265,6 +271,8 @@ def test_transitions_of_a_record_are_those_of_a_flight():
     found = transitions_of(plant, record)
     for key in ("observation", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated")):
         torch.testing.assert_close(found[key], episode[key], rtol=1e-13, atol=1e-13)
+    part, rewards = transitions_of(plant, record.part(0, 10, plant.dt)), episode["next", "reward"][:10]
+    torch.testing.assert_close(part["next", "reward"], rewards, rtol=1e-13, atol=1e-13)
 
 
 def test_pieces_keep_most_of_a_log():
