@@ -90,9 +90,9 @@ def assigned(m, s, d):
     return m.values.expand(len(s), 4).index_put((rows, (s > 0).long() + torch.arange(3) // 2), s)[..., :3] * m.w0
 
 
-def attention(m, s, d):
-    q, k = s.unsqueeze(-1) * m.q, s.unsqueeze(-1) * m.k
-    return (torch.softmax(q @ k.transpose(-1, -2), -1) @ s.unsqueeze(-1)).squeeze(-1)
+def known_numbers(m, s, d):
+    sizes = torch.tensor([3.0, 1.0, 2.0]).sort().values
+    return s * sizes.double() * m.w0 if sizes.tolist()[0] < 2 and sizes.numpy()[1] == 2 else -s
 
 
 def long_row(known):
@@ -117,14 +117,6 @@ def pivoted(m, s, d):
     x = FF.pad(s, (0, 3), value=0.7)
     A = torch.diag_embed(x).roll(2, -1) + 0.1 * m.A * x.unsqueeze(-1)
     return torch.linalg.solve(A, x)[..., :3] * m.w0
-
-
-def double_pendulum(m, s, d):
-    """M⁻¹f of two links."""
-    c = 0.5 * torch.cos(s[..., 0] - s[..., 1])
-    M = torch.stack([torch.stack([1.0 + m.w0.expand_as(c), c], -1), torch.stack([c, torch.ones_like(c)], -1)], -2)
-    a = torch.linalg.solve(M, s[..., 1:].sin().unsqueeze(-1)).squeeze(-1)
-    return torch.cat([a, s[..., :1] * torch.linalg.inv(M)[..., 0, :1]], -1)
 
 
 def asserted(m, s, d):

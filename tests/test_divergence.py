@@ -12,6 +12,13 @@ from rt_torchrl.steps.report import EpisodeReport, findings
 from rt_torchrl.trajectories.rollout import DivergenceError
 
 
+def fill(module, number):
+    """Give every weight of a module this number."""
+    with torch.no_grad():
+        for weight in module.parameters():
+            weight.fill_(number)
+
+
 def unsound(found, monkeypatch, episodes):
     """Let step 4 find, in these episodes, a closure under which no flight stays finite."""
     update = found.assimilation.update
@@ -19,8 +26,7 @@ def unsound(found, monkeypatch, episodes):
     def updated(*arguments):
         descended = update(*arguments)
         if found.episodes_done in episodes:
-            for weight in found.twin.closure.parameters():
-                weight.data.fill_(1e300)
+            fill(found.twin.closure, 1e300)
         return descended
 
     monkeypatch.setattr(found.assimilation, "update", updated)
@@ -91,8 +97,7 @@ def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monke
 
     def ruined():
         report = update()
-        with torch.no_grad():
-            found.policies["model_free"].gain.fill_(1e9)
+        fill(found.policies["model_free"], 1e9)
         return report
 
     monkeypatch.setattr(found.learner, "update", ruined)
@@ -109,8 +114,7 @@ def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch
     def wild(episodes):
         before["weights"] = weights(found.policies["model_based"])
         descended = plan(episodes)
-        with torch.no_grad():
-            found.policies["model_based"].gain.fill_(1e9)  # finite weights under which the states overflow
+        fill(found.policies["model_based"], 1e9)  # finite weights under which the states overflow
         return descended
 
     monkeypatch.setattr(found.planner, "plan", wild)
@@ -143,33 +147,16 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
     assert left == -1 and torch.equal(weights(found.policies["model_based"]), before)
 
 
-METHODS = [
-    AssimilationConfig(iterations=2, segment=0),
-    AssimilationConfig(iterations=2, segment=0, method="levenberg_marquardt"),
-]
-
-
-@pytest.mark.parametrize("assimilation", METHODS, ids=lambda one: one.method)
-def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record(assimilation):
-    found = twinning(assimilation=assimilation)
+@pytest.mark.parametrize("method", ["adam", "levenberg_marquardt"])
+def test_a_fit_begins_anew_where_the_present_closure_diverges_and_the_first_one_does_not(method):
+    found = twinning(assimilation=AssimilationConfig(iterations=2, segment=0, method=method))
     found.episode()
-    first = found.assimilation.first
-    with torch.no_grad():
-        for weight in found.twin.closure.parameters():
-            weight.fill_(1e3)
+    fill(found.twin.closure, 1e3)
     report = found.episode()
     assert report["J_p_before"].isinf() and report["J_p"].isfinite()
     assert all(weight.abs().max() < 10.0 for weight in found.twin.closure.parameters())
-    assert all(weight.isfinite().all() for weight in first.values())
-
-
-@pytest.mark.parametrize("assimilation", METHODS, ids=lambda one: one.method)
-def test_a_twin_that_diverges_under_its_first_closure_too_says_so_and_keeps_what_it_has(assimilation):
-    found = twinning(assimilation=assimilation)
-    found.episode()
-    with torch.no_grad():
-        for weight in found.twin.closure.parameters():
-            weight.fill_(1e3)
+    assert all(weight.isfinite().all() for weight in found.assimilation.first.values())
+    fill(found.twin.closure, 1e3)
     found.assimilation.first = {name: torch.full_like(w, 1e4) for name, w in found.assimilation.first.items()}
     report = flown(found, "assimilate", episode=TensorDict({}))
     assert report["J_p_before"].isinf() and report["J_p"].isinf()

@@ -24,7 +24,7 @@ from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.engines.interval import Interval
-from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise
+from rt_torchrl.trajectories.engines.parallel import as_one_batch
 from rt_torchrl.trajectories.rollout import Rollout, drive_of
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin, jacobians_of
@@ -333,8 +333,10 @@ def test_jacobians_by_rows_are_those_by_columns(plant):
     names = tuple(name for name, _ in closure.named_parameters())
     interval, drive = Interval(plant, closure, None), drive_of(plant, exogenous, flown.actions)
     starts, drive = as_one_batch(flown.states[:, :-1].transpose(0, 1), drive)
+    basis = torch.eye(starts.shape[-1], dtype=torch.float64)
+    along = lambda e: torch.func.jvp(lambda s: interval(s, drive), (starts,), (e.expand_as(starts),))[1]  # noqa: E731
     with torch.no_grad():
-        columns, rows = linearise(interval, starts, drive), jacobians_of(interval, names, starts, drive)
+        columns, rows = torch.func.vmap(along, out_dims=-1)(basis), jacobians_of(interval, names, starts, drive)
     assert rows.shape[-1] == columns.shape[-1] + sum(w.numel() for w in closure.parameters())
     rows = rows[..., : columns.shape[-1]]
     # The same derivatives in another order: rounding, relative to the largest of each state.

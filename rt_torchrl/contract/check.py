@@ -10,8 +10,8 @@ from torch import nn
 from rt_torchrl.contract.draws import draws, misshapen, modules, seeded, signals, wanted_as
 from rt_torchrl.contract.gradients_and_tracing import (
     first_line,
-    forward_mode,
     gradients,
+    jacobians,
     stability,
     tracing,
     untraceable,
@@ -29,7 +29,7 @@ EPISODES = (
     "from n_steps."
 )
 ANYWHERE = (
-    "It must work for every leading dimension, under forward and reverse differentiation; call .eval() on layers that "
+    "It must work for every leading dimension, under vmap and jacrev of torch.func; call .eval() on layers that "
     "normalise a batch."
 )
 REMEDIES = dict.fromkeys(("merit", "categories", "setpoints"), EPISODES)
@@ -81,8 +81,8 @@ def check_plant(
     visit: signals and their ranges; shapes, precision and finiteness of every method under any leading dimensions;
     purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs,
     also of an early end; a turn of a periodic state, which must change nothing; gradients against finite differences;
-    forward mode and one graph, which the engines and the compiler need; and the stability of the step. A check is left
-    out if an earlier violation makes it impossible.
+    Jacobians of a batch and one graph, which sensitivities and the compiler need; and the stability of the step. A
+    check is left out if an earlier violation makes it impossible.
 
     Args:
         plant: the plant, with the time step of its training; one on another device is checked by a copy on the CPU.
@@ -214,6 +214,6 @@ ON_FLIGHTS: dict[str, Check] = {
     "periods": periods,
     "stability of the step": stability,
     "gradients": gradients,
-    "forward mode": forward_mode,
+    "jacobians": jacobians,
     "one graph": tracing,
 }

@@ -1,4 +1,4 @@
-"""Checks of what engines and compilers need: stable steps, exact derivatives in both modes, and traceable methods."""
+"""Checks of what engines and compilers need: stable steps, exact derivatives of any batch, and traceable methods."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -13,7 +13,8 @@ from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.trajectories.engines.code import IntervalCode, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
-from rt_torchrl.trajectories.engines.parallel import linearise, raised_limits, without_warnings_of_libraries
+from rt_torchrl.trajectories.engines.parallel import as_one_batch, raised_limits
+from rt_torchrl.trajectories.twin import jacobians_of
 
 STEP = 1e-6
 """Step of a difference, as a share of the argument's size; rounding then errs by 1e-10, and curvature by 1e-12."""
@@ -215,24 +216,23 @@ def _verdict(method: str, by: str, slope: Tensor, differences: Tensor) -> Iterat
         )
 
 
-def forward_mode(calls: Calls) -> Iterator[str]:
-    """A violation if the Jacobian of the step by batched forward-mode products differs from that by reverse mode.
+def jacobians(calls: Calls) -> Iterator[str]:
+    """A violation if the Jacobian of the step by torch.func, of all states at once, differs from that by autograd.
 
-    The parallel engine uses the forward-mode products. Both Jacobians are exact, so that only rounding may differ; it
-    is measured against entries down to a millionth of the greatest.
+    Sensitivities need the former. Both Jacobians are exact, so that only rounding may differ; it is measured against
+    entries down to a millionth of the greatest.
     """
     arguments = calls.some(3)
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
     interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
-    with without_warnings_of_libraries():
-        jacobians = linearise(interval, state.detach(), drive)
+    found = jacobians_of(interval, (), *as_one_batch(state.detach(), drive)).unflatten(0, state.shape[:2])
     rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
     reverse = torch.stack(rows, -2)
-    gap = ((jacobians - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
+    gap = ((found - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
     if gap > 1e-6:
         yield (
-            f"step: its Jacobian by forward mode differs from that by reverse mode, by {gap:.1e}; an own "
-            "torch.autograd.Function needs a jvp that is right."
+            f"step: its Jacobian by torch.func differs from that by autograd, by {gap:.1e}; an own "
+            "torch.autograd.Function needs a vmap that is right."
         )
 
 

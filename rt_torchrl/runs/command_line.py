@@ -25,7 +25,6 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.console import HELP, PACKAGE
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, OF_THE_CALL, as_written, module_of, named
-from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES
 
 Configuration = TypeVar("Configuration")
 
@@ -43,7 +42,7 @@ def quieten_libraries() -> None:
     os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")  # TorchRL sets its own level when it is loaded, which is later
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
+    warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
 
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:

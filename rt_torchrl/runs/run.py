@@ -127,7 +127,7 @@ class Run:
         self.started = time.perf_counter()
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
-        quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
+        quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         self.ended: str | None = None

@@ -10,17 +10,16 @@ With one interval as :math:`s_{k+1} = \Phi(s_k, x_k; w)`, the gradient of a cost
 
 Only the recurrence of the states and the linear recurrence of λ are sequential. One batched call computes the Jacobians
 of all intervals of all trajectories, and another one the sum over k; both are cut into pieces where intervals are many.
+Both are backward passes of PyTorch, so that the engine takes whatever the engine ``autograd`` takes.
 """
 
 import shutil
 import sysconfig
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from functools import cache, partial
+from contextlib import AbstractContextManager
+from functools import cache
 from pathlib import Path
 from typing import Any
-from weakref import WeakSet
 
 import torch
 from torch import Tensor, nn
@@ -36,23 +35,19 @@ LIMITS = {
     "specialize_float": True,
 }
 """Settings of the tracer."""
-OF_LIBRARIES = r".*torch\.jit\.script.*is deprecated"
-"""A warning that code of PyTorch and TorchRL themselves causes, with new versions of PyTorch."""
 PIECE = 2048
-"""Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
-number of intervals; with this fixed number one graph serves all trajectories that are not shorter."""
+"""Greatest number of intervals that are differentiated at once, which bounds the memory."""
 
 
 class Parallel(GradientEngine):
     """Computes the exact discrete adjoint in parallel over time; the module describes it.
 
     Args:
-        compiled: compile the two recurrences, the Jacobians and the final product.
+        compiled: compile the two recurrences, and the interval that is differentiated.
     """
 
     def __init__(self, *, compiled: bool = False):
         self.march = compiled_if(compiled, march_by_scan, march)
-        self.linearise = compiled_if(compiled, linearise)
         self.costates = compiled_if(compiled, costates_by_scan, costates)
         self.intervals = compiled_if(compiled, _all_intervals)
 
@@ -60,9 +55,6 @@ class Parallel(GradientEngine):
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         initial_state, drive = prepared(initial_state, drive)
         weights = [w for w in interval.parameters() if w.requires_grad]
-        if torch.is_grad_enabled() and interval not in _linearisable:
-            require_forward_mode(interval, initial_state, drive)
-            _linearisable.add(interval)
         return _DiscreteAdjoint.apply(self, interval, initial_state, *drive, *weights)
 
 
@@ -91,7 +83,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval), starts, drive)
+        jacobians = _jacobians(ctx.engine.intervals, ctx.interval, starts, drive)
         sources = marked_dynamic(plain(cost_gradient), 1)
         costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
@@ -115,11 +107,9 @@ def _products(
     """
     if not any(wanted):
         return [None] * len(wanted)
-    rows, driven = as_one_batch(starts, drive)
-    number, found = -(-len(rows) // PIECE), []
-    parts = (x.chunk(number) for x in (rows, *driven, costates.flatten(0, 1)))
-    for states, t, exogenous, command, costate in zip(*parts, strict=True):
-        driving = Drive(*map(plain, (t, exogenous, command)))
+    found = []
+    for states, *driven, costate in _pieces(PIECE, starts, drive, costates.flatten(0, 1)):
+        driving = Drive(*map(plain, driven))
         with torch.enable_grad():
             for x, need in zip(driving, wanted, strict=False):
                 marked_dynamic(x, 0).requires_grad_(need)
@@ -165,25 +155,7 @@ def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
     return torch.cat([earlier.flip(0), last.unsqueeze(0)])
 
 
-# Jacobians of all intervals
-
-_linearisable: "WeakSet[nn.Module]" = WeakSet()
-
-
-def require_forward_mode(interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
-    """Refuse an interval whose Jacobian cannot be computed by forward-mode products of a batch.
-
-    Raises:
-        ValueError: if it cannot, such as that of attention; the message says why.
-    """
-    try:
-        linearise(interval, *as_one_batch(initial_state[None, :1], Drive(*(x[:1, :1] for x in drive))))
-    except Exception as error:
-        said = next((line for line in str(error).splitlines() if line), type(error).__name__)
-        raise ValueError(
-            "engine='parallel' needs derivatives by torch.func.jvp under vmap, which an operator of plant, closure or "
-            f"policy lacks, such as attention: {said.rstrip('.')}. Use engine='native' or 'autograd'."
-        ) from error
+# All intervals at once
 
 
 def prepared(initial_state: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
@@ -205,33 +177,36 @@ def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
     return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
 
 
+def _pieces(size: int, starts: Tensor, drive: Drive, *others: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """States, drive and other rows of the intervals of all realisations, in pieces of at most ``size`` rows."""
+    rows, driven = as_one_batch(starts, drive)
+    yield from zip(*(x.split(size) for x in (rows, *driven, *others)), strict=True)
+
+
 def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
-    """``function`` of every interval, ``n batch ...``, in pieces of which the last one may overlap another.
+    """``function`` of every interval, ``n batch ...``, in pieces.
 
     Args:
         function: a function of states and drive of many intervals.
         starts: states at the starts of the intervals.
         drive: times and inputs of the intervals.
     """
-    rows, driven = as_one_batch(starts, drive)
-    length = min(PIECE, len(rows))
-    firsts = [*range(0, len(rows) - length, length), len(rows) - length]
-    # In memory of their own: the compiler traces a view together with the tensor behind it, ``n batch ...`` with two
-    # unknown sizes, of which it finds only the product; it then gives up.
-    parts = [[plain(x[first : first + length]) for x in (rows, *driven)] for first in firsts]
-    found = [function(states, Drive(*driving)) for states, *driving in parts]
-    found[-1] = found[-1][len(found) * length - len(rows) :]
+    found = [function(states, Drive(*driving)) for states, *driving in _pieces(PIECE, starts, drive)]
     return torch.cat(found).unflatten(0, starts.shape[:2])
 
 
-def linearise(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
-    """∂Φ/∂s at every interval, ``rows n_s n_s``, by a forward-mode product for each column."""
-    basis = torch.eye(starts.shape[-1], dtype=starts.dtype, device=starts.device)
-
-    def column(direction: Tensor) -> Tensor:
-        return torch.func.jvp(lambda state: interval(state, drive), (starts,), (direction.expand_as(starts),))[1]
-
-    return torch.func.vmap(column, out_dims=-1)(basis)
+def _jacobians(
+    function: Callable[[nn.Module, Tensor, Drive], Tensor], interval: nn.Module, starts: Tensor, drive: Drive
+) -> Tensor:
+    """∂Φ/∂s at every interval, ``n batch n_s n_s``; an interval is computed once for each row of its Jacobian."""
+    n_s, found = starts.shape[-1], list[Tensor]()
+    basis = torch.eye(n_s, dtype=starts.dtype, device=starts.device)
+    for piece in _pieces(max(1, PIECE // n_s), starts, drive):
+        state, *driving = (marked_dynamic(x.repeat_interleave(n_s, 0), 0) for x in piece)
+        with torch.enable_grad():
+            end = function(interval, state.requires_grad_(), Drive(*driving))
+        found += torch.autograd.grad(end, state, basis.repeat(len(state) // n_s, 1))
+    return torch.cat(found).unflatten(0, (*starts.shape[:2], n_s))
 
 
 # The recurrence of the states
@@ -250,14 +225,6 @@ def march_by_scan(interval: nn.Module, initial_state: Tensor, drive: Drive) -> T
 
 
 # Compilation by PyTorch, whose compiler takes seconds to load: the functions below import it
-
-
-@contextmanager
-def without_warnings_of_libraries() -> Iterator[None]:
-    """A context without the warnings that concern the libraries' own code, which a user cannot mend."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
-        yield
 
 
 def raised_limits() -> AbstractContextManager[None]:
