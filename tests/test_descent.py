@@ -49,15 +49,6 @@ def test_adam_reaches_the_minimum():
     assert found.gradient == pytest.approx(math.sqrt(1 + 64 + 25), rel=1e-14)
 
 
-def test_lbfgs_reaches_the_minimum_of_a_quadratic_in_few_gradients():
-    point = Point()
-    found = Descent(point, DescentConfig(optimiser="lbfgs", rate=1.0)).run(Bowl(point), 25)
-    # Superlinear in three directions, until torch's L-BFGS stops at a change of the cost below 1e-9.
-    assert found.best < 2e-9
-    # ½c(x − m)² < 2e-9 with c ≥ 1.
-    torch.testing.assert_close(point.at.detach(), MINIMUM, rtol=0, atol=7e-5)
-
-
 @pytest.mark.parametrize("iterations", [3, 100])
 def test_lbfgs_evaluates_nothing_beside_its_gradients(iterations):
     """Its line search has evaluated where it ends; Adam has not evaluated its last step."""

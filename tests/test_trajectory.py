@@ -69,21 +69,6 @@ def test_converges_to_the_matrix_exponential(engine):
     assert errors[2] < 3e-5
 
 
-def test_policy_in_the_loop_samples_and_holds():
-    """With a = −K s_k held, s_{k+1} = (A_d − B_d K) s_k + B_d d_k."""
-    plant, gain = LinearQuadratic(dt=0.02, horizon=3.0, noise=0.5), np.array([[0.8, 0.3]])
-    state, exogenous, _ = drawn(plant, 2)
-    flown = Rollout(plant, plant.closure, LinearGain(gain))(state, exogenous)
-    # The Runge-Kutta error over time T: T dt⁴‖A‖⁵/120 with ‖A‖⁵ = 4, of a state of about 2: 3e-8.
-    for row, (start, disturbance) in enumerate(zip(state.numpy(), exogenous[..., 0].numpy(), strict=True)):
-        current = start
-        for k, d in enumerate(disturbance):
-            command = (-gain @ current).item()
-            assert flown.actions[row, k, 0].item() == pytest.approx(command, abs=3e-8)
-            current = held_solution(current, [command + d], 0.02)[-1]
-        np.testing.assert_allclose(flown.states[row, -1].detach().numpy(), current, rtol=0, atol=3e-8)
-
-
 class Clock(LinearQuadratic):
     """A plant that shows the policy the time, and whose cost depends on it."""
 

@@ -338,7 +338,7 @@ class ObjectCode:
 
     def __call__(self, *arguments: np.ndarray | int) -> None:
         """Run the function; of an array, whose numbers lie side by side, it gets the address."""
-        self._function(*(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
+        self.bound(*arguments)()
 
     def bound(self, *arguments: np.ndarray | int) -> Callable[[], None]:
         """The call with these arrays, whose numbers may change between calls; it keeps their memory alive."""

@@ -21,7 +21,6 @@ from torch.nn import functional
 
 from rt_torchrl.plants.plant import Plant, final_cost
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
-from rt_torchrl.trajectories.engines import Parallel
 from rt_torchrl.trajectories.engines.code import require_pure_once
 from rt_torchrl.trajectories.engines.interval import (
     Autograd,
@@ -32,6 +31,7 @@ from rt_torchrl.trajectories.engines.interval import (
     OdeintAdjoint,
 )
 from rt_torchrl.trajectories.engines.native import Native
+from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 Engine = Literal["native", "parallel", "odeint_adjoint", "autograd"]
