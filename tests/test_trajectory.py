@@ -91,6 +91,18 @@ def test_time_and_inputs_reach_the_policy_and_the_cost(engine):
     torch.testing.assert_close(control_cost(plant, flown), t.new_full((2,), 3.875))
 
 
+def test_segments_are_parts_on_the_clock_of_the_plant():
+    plant = LinearQuadratic(horizon=1.0)
+    state, exogenous, command = drawn(plant, 2)
+    flown = Rollout(plant, plant.closure)(state, exogenous, command, start=3.0)._replace(seen=torch.rand(2, 11) > 0.5)
+    segments = flown.segments(4, plant.dt).each()  # the last two intervals are left out
+    parts = [flown.rows(k).part(first, first + 4, plant.dt) for k in (0, 1) for first in (0, 4)]
+    assert [part.start for part in parts] == [3.0, 3.4, 3.0, 3.4] == [segment.start for segment in segments]
+    for part, segment in zip(parts, segments, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(part, segment, strict=True) if isinstance(a, torch.Tensor))
+        assert part.states.shape == (5, 2) and part.seen.shape == (5,) and part.actions.shape == (4, 1)
+
+
 def test_identification_cost_of_a_growing_error():
     """Error (t, 0): J_p = dt Σ ½t_k² over k = 1 ... n = ½dt³ n(n + 1)(2n + 1)/6; the start does not count."""
     plant, n, h = LinearQuadratic(dt=0.1, horizon=4.0), 40, 0.1
