@@ -10,9 +10,9 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded
-from torch import nn
 
 from rt_torchrl import StackedObservations, check_plant
+from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine import plant as module
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
@@ -22,7 +22,6 @@ from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, PaperCost, WindTurbi
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine, steps_of
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.evaluation.unseen import RealEpisodes
-from rt_torchrl.plants.policies import SmoothClip
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -160,33 +159,20 @@ def test_filters_are_the_exponential_recursion_for_held_inputs():
         assert states[k + 1, 1] == pytest.approx(omega_hat, abs=8e-5)
 
 
-class ManyAffine(nn.Module):
-    """One random affine policy per row of the batch, through the smooth clip."""
-
-    def __init__(self, count, scale, actions, generator):
-        super().__init__()
-        self.weight = scale * torch.randn(count, len(actions), 2, generator=generator, dtype=torch.float64)
-        self.bias = scale * torch.randn(count, len(actions), generator=generator, dtype=torch.float64)
-        self.clip = SmoothClip(actions)
-
-    def forward(self, observation):
-        return self.clip((self.weight * observation.unsqueeze(-2)).sum(-1) + self.bias)
-
-
-def test_no_policy_breaks_the_simulation(unchecked):
-    """1000 random policies over a whole episode: braked to standstill, stalled or racing, all stay finite."""
-    plant, generator, count = WindTurbine(), torch.Generator().manual_seed(0), 1000
-    policy = ManyAffine(count, 10.0, plant.actions, generator)
+def test_no_command_breaks_the_simulation():
+    """1000 held commands over a whole episode: braked to standstill, stalled or racing, all stay finite."""
+    plant, generator, count = WindTurbine(), seeded(), 1000
+    state, wind = plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+    held = random_commands(plant, (count, 1), generator).expand(-1, plant.n_steps, -1)
     with torch.no_grad():
-        state, wind = plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
-        states = Rollout(plant, plant.closure, policy)(state, wind).states
+        states = Rollout(plant, plant.closure)(state, wind, held).states
     assert states.isfinite().all()
     omega = states[..., 0]
     # Both ends have been visited: slower than a fifth of rated (cut-in of the generator), and overspeed.
     assert (omega.amin(1) < 0.2 * OMEGA_RATED).sum() > 20 and (omega.amax(1) > 1.2 * OMEGA_RATED).sum() > 20
     assert omega.min() >= 0
     # Beyond the λ where C_p is negative at every pitch, wind and generator both brake: no rotor gets there in its
-    # strongest wind, whatever the policy does.
+    # strongest wind, whatever is commanded.
     lam, beta = torch.arange(10.0, 20.0, 0.01).double(), torch.arange(0.0, 30.1, 0.5).double()
     drives = (plant.closure(torch.cartesian_prod(lam, beta)).reshape(len(lam), -1) > 0).any(1)
     runaway = lam[drives].max() + 0.01
