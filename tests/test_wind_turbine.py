@@ -121,6 +121,16 @@ def test_reference_speed_in_its_three_regions(u, expected):
         assert found == pytest.approx(expected, rel=1e-12)
 
 
+def test_the_torque_fades_where_the_rotor_hardly_turns():
+    """Of a C_p that does not: τ_a = ½ρπR³(C_p/λ)u² from λ = 1 on, half of it at 0.5, and nothing at standstill."""
+    lam, u = double(0.0, 0.5, 1.0, 4.0), 10.0
+    closure = torch.nn.Linear(2, 1, dtype=torch.float64).requires_grad_(False)
+    closure.weight.fill_(0.0), closure.bias.fill_(0.1)
+    found = WindTurbine().aerodynamic_torque(lam * u / R, double(0.0), double(u), closure)
+    expected = 0.5 * RHO * math.pi * R**3 * u**2 * 0.1 * double(0.0, 0.5 / 0.5, 1.0, 1.0 / 4.0)
+    torch.testing.assert_close(found, expected)
+
+
 def test_cost_counts_speed_and_power_errors():
     """e_1 = 0.1 and e_P = −0.2, put together by hand: ½(2·0.01 + 3·0.04)."""
     plant = WindTurbine(cost=PaperCost(speed=2.0, power=3.0))

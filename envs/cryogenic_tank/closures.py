@@ -62,16 +62,15 @@ class CubicVentLaw(nn.Module):
 
     Args:
         action: the pressure drop and its range.
-        weight_scale: standard deviation of the initial weights; zero starts with the valve half open.
-        generator: source of the initial weights.
+        generator: source of the initial weights, whose standard deviation is 0.3; zero is a valve that is half open.
     """
 
     reference_error = 3.0  # ℓ, in the unit of the observation
 
-    def __init__(self, action: Signal, *, weight_scale: float = 0.3, generator: torch.Generator):
+    def __init__(self, action: Signal, *, generator: torch.Generator):
         super().__init__()
         first = torch.randn(3, generator=generator, dtype=torch.float64, device=generator.device)
-        self.scaled = nn.Parameter(weight_scale * first)
+        self.scaled = nn.Parameter(0.3 * first)
         self.clip = SmoothClip((action,), device=generator.device)
 
     @property

@@ -80,12 +80,12 @@ class SaturatedAffine(nn.Module):
 class SaturatedMLP(nn.Module):
     r"""A multilayer perceptron through the smooth clip.
 
+    The last layer's initial weights are a tenth of the others, so that the policy starts near the middle of the ranges.
+
     Args:
         n_observations: number of observations.
         actions: the actions and their ranges.
         hidden: width of each hidden layer.
-        output_scale: factor on the last layer's initial weights, so that the policy starts near the middle of the
-            ranges.
         generator: source of the initial weights.
     """
 
@@ -95,13 +95,12 @@ class SaturatedMLP(nn.Module):
         actions: Sequence[Signal],
         *,
         hidden: Sequence[int] = (32, 32),
-        output_scale: float = 0.1,
         generator: torch.Generator,
     ):
         super().__init__()
         self.network = mlp(n_observations, hidden, len(actions), generator=generator)
         with torch.no_grad():
-            self.network[-1].get_parameter("weight").mul_(output_scale)
+            self.network[-1].get_parameter("weight").mul_(0.1)
         self.clip = SmoothClip(actions, device=generator.device)
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
@@ -115,7 +114,6 @@ def mlp(
     *,
     generator: torch.Generator,
     activation: type[nn.Module] = nn.Tanh,
-    dtype: torch.dtype = torch.float64,
 ) -> nn.Sequential:
     """A perceptron with smooth units (adjoints need derivatives), LeCun-normal weights and zero biases."""
     widths = (n_inputs, *hidden, n_outputs)
@@ -123,7 +121,7 @@ def mlp(
         raise ValueError(f"layer widths {widths} must all be at least 1.")
     layers: list[nn.Module] = []
     for i, (fan_in, fan_out) in enumerate(zip(widths, widths[1:], strict=False)):
-        linear = nn.Linear(fan_in, fan_out, dtype=dtype, device=generator.device)
+        linear = nn.Linear(fan_in, fan_out, dtype=torch.float64, device=generator.device)
         with torch.no_grad():
             linear.weight.normal_(0.0, fan_in**-0.5, generator=generator)
             linear.bias.zero_()
