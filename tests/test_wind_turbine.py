@@ -121,6 +121,14 @@ def test_reference_speed_in_its_three_regions(u, expected):
         assert found == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("dt", [0.5, 0.25])
+def test_actuators_move_by_no_more_than_their_rates_times_the_interval(dt):
+    plant = WindTurbine(dt=dt)
+    state = start(plant, 1.2, u=11.0, command=(20e3, 10.0))
+    assert plant.actuate(state, double(43e3, 0.0)).tolist() == [[20e3 + 15e3 * dt, 10.0 - 8.0 * dt]]
+    assert plant.actuate(state, double(20.1e3, 9.9)).tolist() == [[20.1e3, 9.9]]
+
+
 def test_the_torque_fades_where_the_rotor_hardly_turns():
     """Of a C_p that does not: τ_a = ½ρπR³(C_p/λ)u² from λ = 1 on, half of it at 0.5, and nothing at standstill."""
     lam, u = double(0.0, 0.5, 1.0, 4.0), 10.0
