@@ -278,6 +278,16 @@ def test_the_torque_joins_its_regions_continuously(controller):
     assert controller.torque(torch.tensor([60.0, 60.0], dtype=torch.float64), calm).tolist() == [0.0, 0.0]
 
 
+def test_the_pitch_is_the_scheduled_pi_law_by_hand(controller):
+    speed, integral, pitch = 130.0, 3.0, math.radians(5.0)
+    state = start(controller.plant, speed / N_G, u=15.0, command=(43e3, 5.0))
+    command, memory = controller.law(state, double(speed, integral).unsqueeze(0), torch.zeros(1, 1).double())
+    integral += 0.5 * (speed - 122.9096)
+    expected = (0.01882681 * (speed - 122.9096) + 0.008068634 * integral) / (1.0 + pitch / 0.1099965)
+    assert command[0, 1].item() == pytest.approx(math.degrees(expected), rel=1e-6)
+    assert memory[0].tolist() == pytest.approx([speed, integral], rel=1e-6)
+
+
 def test_a_steady_wind_above_rated_is_held_at_rated_speed(controller):
     plant = controller.plant
     state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
