@@ -129,6 +129,10 @@ def test_a_replay_goes_on_where_the_record_does():
     pushed = torch.full((*inputs.shape[:2], 1), 2.0, dtype=torch.float64)
     states = Rollout(plant, plant.closure)(start, inputs, pushed).states
     assert states[:, -1, 0].abs().min() > 2.0 * plant.reach
+    # A record that comes back has ended for good: nothing at first, then ten for each interval.
+    back = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [0.0, 0.0], [0.0, 0.0]]]).double()
+    record = Trajectory(back, torch.zeros(1, 3, 1).double(), torch.zeros(1, 3, 1).double())
+    assert control_cost(Falling(horizon=0.3), record).item() == pytest.approx(20.0 / 3.0, rel=1e-12)
 
 
 def actor_of(plant, policy):

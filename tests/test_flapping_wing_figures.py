@@ -12,6 +12,7 @@ from torch import nn
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -116,6 +117,12 @@ def test_visited_angles_are_those_of_the_kinematics(snapshot):
     # The floor of the speed, 0.01 m/s, shortens the direction by (0.01 / 0.7 m/s)^2 / 2 where the wing is slowest.
     np.testing.assert_allclose(sine[moving], (direction * np.cos(pitch))[moving], atol=2e-4)
     np.testing.assert_allclose(cosine[moving], (direction * np.sin(pitch))[moving], atol=2e-4)
+
+
+def test_visited_angles_are_those_of_the_element_at_seventy_percent(snapshot):
+    """The sines of the six nodes are 0.05, 0.26, 0.56, 0.83, 0.97 and 1.00 of the length."""
+    everywhere = visited_features(snapshot.plant, snapshot.record)
+    assert torch.equal(figures.visited_features(snapshot), everywhere[:, 3])
 
 
 def test_polars_of_a_law_without_named_coefficients(snapshot):
