@@ -3,12 +3,10 @@
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from small_runs import SMALL
+from small_runs import small_run
 from test_algorithm import twinning
 from test_classical import PD, episodes
 
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig
 from rt_torchrl.steps.start import FirstController
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -75,10 +73,7 @@ def test_a_harmful_controller_is_not_imitated():
 
 
 def run(folder, **options):
-    config = RunConfig(
-        episodes=2, log_dir=folder, compiled=False, unseen=3, untrained=0, figures=False, twinning=SMALL, **options
-    )
-    return Run(config, LinearQuadratic(horizon=2.0), first=PD)
+    return small_run(folder, 2, untrained=0, parts={"first": PD}, **options)
 
 
 def test_a_run_begins_with_the_controller_once(tmp_path):
@@ -93,9 +88,8 @@ def test_a_run_begins_with_the_controller_once(tmp_path):
 
 
 def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
-    config = RunConfig(log_dir=tmp_path / "run", start="controller")
     with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
-        Run(config, LinearQuadratic(horizon=2.0))
+        small_run(tmp_path / "run", start="controller")
     assert not (tmp_path / "run").exists()
 
 

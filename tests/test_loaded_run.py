@@ -11,13 +11,13 @@ import sys
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_runs import SMALL
+from small_runs import SMALL, small_run
 from test_classical import PD
 from test_documentation import leave_finished_run
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
 
-from rt_torchrl import Run, load_run
+from rt_torchrl import load_run
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.options import choices
 from rt_torchrl.plants.policies import SaturatedMLP
@@ -290,13 +290,8 @@ class Worn(RunConfig):
 @pytest.mark.parametrize("start", ["random", "controller"])
 def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start):
     """The flight of the controller wears the system, too, and episodes that were not made do not."""
-    options = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False, "start": start}
-    run = Run(
-        Worn(log_dir=tmp_path, episodes=5, twinning=SMALL, **options),
-        LinearQuadratic(horizon=2.0),
-        first=PD,
-        callbacks=[lambda episodes: "enough" if len(episodes) == 2 else None],
-    )
+    parts = {"first": PD, "callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
+    run = small_run(tmp_path, 5, config=Worn, parts=parts, untrained=0, start=start)
     run.train()
     found = load_run(tmp_path, Worn, plant=LinearQuadratic(horizon=2.0)).true_closure()
     assert torch.equal(found.matrix, run.unseen.closure.matrix)
@@ -304,8 +299,7 @@ def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start):
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     hypotheses = dataclasses.replace(SMALL, hypotheses=HypothesesConfig(call=0.0))
-    options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
-    run = Run(RunConfig(episodes=1, log_dir=tmp_path, twinning=hypotheses, **options), Suspecting(horizon=2.0))
+    run = small_run(tmp_path, 1, Suspecting(horizon=2.0), untrained=0, twinning=hypotheses)
     run.train()
     trained = run.algorithm.twin
     loaded = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0))

@@ -30,7 +30,6 @@ from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.results import SCREEN, closure_lines, fit_lines, next_steps, results_table
 from rt_torchrl.runs.results import progress as progress_line
-from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
@@ -41,8 +40,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
     nothing = {part: dataclasses.replace(getattr(SMALL, part), iterations=0) for part in ("assimilation", "planner")}
     twinning = dataclasses.replace(SMALL, **nothing)
-    options = {"compiled": False, "unseen": 3, "figures": False, "untrained": 0, "episodes": 1}
-    metrics = Run(RunConfig(log_dir=tmp_path, twinning=twinning, **options), LinearQuadratic(horizon=2.0)).train()
+    metrics = small_run(tmp_path, 1, untrained=0, twinning=twinning).train()
     assert json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail) == metrics
     assert metrics["episodes"][0]["J_p"] is None and metrics["episodes"][0]["real_cost"] > 0.0
     assert "J_a model-based" in capsys.readouterr().out
@@ -174,10 +172,7 @@ REAL = "cost/real episode live policy"  # without brackets, which MLflow does no
 
 
 def trained(folder, logger):
-    config = RunConfig(
-        episodes=2, log_dir=folder, unseen=3, untrained=0, figures=False, loggers=(logger,), twinning=SMALL
-    )
-    metrics = Run(config, LinearQuadratic(horizon=2.0)).train()
+    metrics = small_run(folder, 2, untrained=0, loggers=(logger,)).train()
     return [episode["real_cost"] for episode in metrics["episodes"]]
 
 
@@ -257,10 +252,7 @@ def stopped(tmp_path_factory):
         seen.append(len(found))
         return "two are enough" if len(found) == 2 else None
 
-    config = RunConfig(
-        episodes=4, log_dir=folder, unseen=3, untrained=0, figures=False, loggers=("csv",), twinning=SMALL
-    )
-    metrics = Run(config, LinearQuadratic(horizon=2.0), callbacks=[end_after_two]).train()
+    metrics = small_run(folder, 4, untrained=0, loggers=("csv",), parts={"callbacks": [end_after_two]}).train()
     return folder, metrics, seen
 
 

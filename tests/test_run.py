@@ -18,7 +18,6 @@ from torchrl.collectors import Collector
 from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
@@ -126,8 +125,7 @@ class Worn(RunConfig):
 def test_the_twin_follows_a_system_that_wears(tmp_path):
     assimilation = AssimilationConfig(method="levenberg_marquardt", inputs="record")
     twinning = dataclasses.replace(SMALL, assimilation=assimilation)
-    options = {"compiled": False, "unseen": 3, "figures": False, "twinning": twinning, "episodes": 3}
-    run = Run(Worn(log_dir=tmp_path, **options), LinearQuadratic(horizon=4.0))
+    run = small_run(tmp_path, plant=LinearQuadratic(horizon=4.0), config=Worn, twinning=twinning)
     found = run.train()
     closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]
     # What one record of 40 samples shows of four weights, without noise: to rounding.
@@ -150,8 +148,7 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     class Heavier(LinearQuadratic):
         B = ((0.0,), (0.75,))
 
-    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures=False, twinning=SMALL, episodes=1)
-    run = Run(config, Heavier(horizon=2.0), believed=LinearQuadratic(horizon=2.0))
+    run = small_run(tmp_path, 1, Heavier(horizon=2.0), parts={"believed": LinearQuadratic(horizon=2.0)})
     found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
     assert isinstance(run.unseen.plant, Heavier)
@@ -200,9 +197,8 @@ class Dear(Suspecting):
 
 def with_all_parts(folder, episodes, **options):
     """A run on a system with a lag that its twin suspects, and with costs that contradict the twin."""
-    options |= {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "twinning": PARTS}
-    config = RunConfig(episodes=episodes, log_dir=folder, **options)
-    return Run(config, LaggedActuator(Dear(horizon=2.0), "force", LAG), believed=Suspecting(horizon=2.0))
+    system, parts = LaggedActuator(Dear(horizon=2.0), "force", LAG), {"believed": Suspecting(horizon=2.0)}
+    return small_run(folder, episodes, system, parts=parts, untrained=0, twinning=PARTS, **options)
 
 
 def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, monkeypatch):
@@ -252,9 +248,8 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
     class Other(LinearQuadratic):
         name = "other"
 
-    config = RunConfig(log_dir=tmp_path, resume=True, twinning=SMALL)
     with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
-        Run(config, Other(horizon=2.0))
+        small_run(tmp_path, 1, Other(horizon=2.0), resume=True)
 
 
 @pytest.mark.parametrize(
@@ -288,10 +283,9 @@ def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
         def observe(self, t, state, exogenous):
             return state.detach()
 
-    config = RunConfig(log_dir=tmp_path / "run", compiled=False, twinning=SMALL)
-    for plants in ((Forgetful(), None), (LinearQuadratic(), Forgetful())):
+    for plant, parts in ((Forgetful(), {}), (LinearQuadratic(), {"believed": Forgetful()})):
         with pytest.raises(PlantContractError, match="observe: autograd finds no dependence on state 'position'"):
-            Run(config, plants[0], believed=plants[1])
+            small_run(tmp_path / "run", 1, plant, parts=parts)
     assert not (tmp_path / "run").exists()
 
 
@@ -329,8 +323,7 @@ def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
         return Collector(env, acting, frames_per_batch=plant.n_steps, total_frames=-1, reset_at_each_iter=True)
 
     def run(folder, **parts):
-        config = RunConfig(episodes=3, log_dir=tmp_path / folder, unseen=3, figures=False, twinning=SMALL)
-        return Run(config, LinearQuadratic(horizon=2.0), **parts).train()
+        return small_run(tmp_path / folder, parts=parts).train()
 
     parts = {
         "learner": partial(ActorCritic, replay=noted("replay", LongTermMemory)),

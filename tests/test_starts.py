@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_runs import SMALL
+from small_runs import SMALL, small_run
 from tensordict import TensorDict
 from test_classical import PD
 from test_export_recipe import recipe
@@ -60,9 +60,8 @@ class OtherPlant(LinearQuadratic):
 
 
 def training(folder, plant=None, episodes=2, twinning=TWINNING, **options):
-    options = {"figures": False, "untrained": 0, "unseen": 2, "figures_every": 0, "compiled": False} | options
-    config = Config(episodes=episodes, log_dir=folder, twinning=twinning, **options)
-    return Run(config, plant or config.plant(), first=PD)
+    options = {"untrained": 0, "unseen": 2, "twinning": twinning} | options
+    return small_run(folder, episodes, plant or Config().plant(), config=Config, parts={"first": PD}, **options)
 
 
 @pytest.fixture(scope="module")
