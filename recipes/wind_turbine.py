@@ -37,7 +37,7 @@ from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanContr
 from rt_torchrl.envs.wind_turbine.disturbances import STORM, KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
-from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
+from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
 from rt_torchrl.options import Share, Text
 
@@ -159,22 +159,13 @@ class Config(RunConfig):
         """The turbine as its twin knows it."""
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
-            wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
+            try:
+                wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
+            except (ValueError, OSError) as error:
+                raise ValueError(f"wind_files: {error}") from error
         usual = "paper" if self.preset == "paper" and self.policy == "mlp" else OBSERVED[self.policy]
         cost = self.engineering if self.task == "engineering" else PaperCost()
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))
-
-    @staticmethod
-    def wind_of(path: Path) -> WindRecord:
-        """The wind record in one of the ``wind_files``.
-
-        Raises:
-            ValueError: if the file cannot be read, or holds no wind.
-        """
-        try:
-            return read_wind(path)
-        except (ValueError, OSError) as error:
-            raise ValueError(f"wind_files: {error}") from error
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
         if self.policy == "scheduled":

@@ -38,7 +38,7 @@ NO_OPTIONS = ROOT / "tests" / "no_options.json"
 @pytest.fixture(autouse=True)
 def _with_every_logger(monkeypatch):
     """As if the packages that the documentation tells to install were there."""
-    monkeypatch.setattr("rt_torchrl.runs.run_config.PACKAGES", {})
+    monkeypatch.setattr("rt_torchrl.runs.run_config.PACKAGES", ())
 
 
 def refusal(name, arguments):

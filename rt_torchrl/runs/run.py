@@ -35,7 +35,7 @@ from rt_torchrl.runs.real_side import (
     simulated,
 )
 from rt_torchrl.runs.results import next_steps, results_table
-from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
+from rt_torchrl.runs.run_config import Callback, EarlyStopping, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
 from rt_torchrl.runs.settings import as_written, flat
@@ -131,8 +131,9 @@ class Run:
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         self.ended: str | None = None
-        stopping = self.config.stopping()
-        self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
+        self.callbacks: list[Callback] = list(callbacks)
+        if config.patience:
+            self.callbacks.append(EarlyStopping(patience=config.patience))
         device = require_device(config.device)
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)

@@ -74,20 +74,8 @@ class EarlyStopping:
 
 
 LoggerName = Literal["csv", "wandb", "mlflow"]
-PACKAGES: dict[LoggerName, str] = {"wandb": "wandb", "mlflow": "mlflow"}
-"""Package that a logger needs."""
-
-
-def require_loggers(names: Sequence[LoggerName]) -> None:
-    """Refuse loggers that lack their package, before any work.
-
-    Raises:
-        ValueError: if there is one; it says what to install.
-    """
-    for name in names:
-        package = PACKAGES.get(name)
-        if package and importlib.util.find_spec(package) is None:
-            raise ValueError(f"loggers={name!r} needs a package that is not installed: pip install {package}.")
+PACKAGES: tuple[LoggerName, ...] = ("wandb", "mlflow")
+"""Loggers that need the package of their name."""
 
 
 SPREAD_OF_IMITATION = 0.02
@@ -216,7 +204,9 @@ class RunConfig:
             raise ValueError(
                 f"model_free_policy={self.model_free_policy!r} does not exist; choose same, {' or '.join(known)}."
             )
-        require_loggers(self.loggers)
+        for logger in self.loggers:
+            if logger in PACKAGES and importlib.util.find_spec(logger) is None:
+                raise ValueError(f"loggers={logger!r} needs a package that is not installed: pip install {logger}.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.reference and self.limit_episodes and self.device != "cpu" and self.limit() is not None:
@@ -285,10 +275,6 @@ class RunConfig:
         if planner.method != "receding_horizon":
             return policies
         return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
-
-    def stopping(self) -> EarlyStopping | None:
-        """What ends the training early; None if nothing does."""
-        return EarlyStopping(patience=self.patience) if self.patience else None
 
     def limit(self) -> LimitConfig | None:
         """How the limit of the cost and model predictive control beside it are computed; None leaves them out.
