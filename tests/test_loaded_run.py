@@ -115,15 +115,11 @@ class Room(LinearQuadratic):
     name = "room"
 """
 TRAIN = """
-import json, sys
+import sys
 from pathlib import Path
-import torch
 from room import Room
-from rt_torchrl import Run, configuration, load_run
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.steps.config import HypothesesConfig
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from test_export_recipe import leave_run_of
+from rt_torchrl import RunConfig, configuration, load_run
 print("runs")
 @configuration
 class Config(RunConfig):
@@ -131,11 +127,8 @@ class Config(RunConfig):
     def plant(self):
         return Room(horizon=self.horizon)
 def main(config):
-    folder, plant = Path(sys.argv[1]), config.plant()
-    generator = torch.Generator().manual_seed(0)
-    parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
-    torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
-    (folder / "config.json").write_text(json.dumps(settings_of(config, plant.name), default=str))
+    folder = Path(sys.argv[1])
+    leave_run_of(folder, config, config.plant())
     assert type(load_run(folder).plant) is Room
 if __name__ == "__main__":
     main(Config(horizon=2.0))

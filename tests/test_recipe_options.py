@@ -47,11 +47,7 @@ def made(plant, **options):
         ("pendulum", {"judged_on": "paper"}, "judged_on='paper' does not exist; choose real or plant"),
         ("pendulum", {"horizon": 1e308}, r"horizon=1e\+308 s of plant 'pendulum' is inf steps dt=0.05 s"),
         *[(plant, {"dt": 0.0}, "dt=0.0 s") for plant in ("wind_turbine", "flapping_wing", "cryogenic_tank")],
-        *[
-            (plant, {"horizon": value}, f"horizon=.* of plant '{plant}' is .* steps .*at most 1e")
-            for plant in ("wind_turbine", "flapping_wing", "cryogenic_tank")
-            for value in (1e308, 1e15)
-        ],
+        ("cryogenic_tank", {"horizon": 1e15}, "horizon=.* of plant 'cryogenic_tank' is .* steps .*at most 1e"),
     ],
 )
 def test_options_out_of_range_are_refused(plant, options, message):
