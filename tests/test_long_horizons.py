@@ -58,13 +58,12 @@ def main(n_steps):
     cost = rollout.costs(state, exogenous).mean()
     weights = list(plant.closure.parameters())
     gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, weights)])
-    direction = torch.randn(len(gradient), generator=generator, dtype=torch.float64)
+    direction, start = torch.randn(len(gradient), generator=generator).double(), nn.utils.parameters_to_vector(weights)
     step, costs = 1e-6, []
     for sign in (1.0, -1.0):
+        nn.utils.vector_to_parameters((start + sign * step * direction).detach(), weights)
         with torch.no_grad():
-            nn.utils.vector_to_parameters(nn.utils.parameters_to_vector(weights) + sign * step * direction, weights)
             costs.append(rollout.costs(state, exogenous).mean().item())
-            nn.utils.vector_to_parameters(nn.utils.parameters_to_vector(weights) - sign * step * direction, weights)
     import resource  # which Windows lacks
 
     unit = 2**30 if sys.platform == "darwin" else 2**20

@@ -207,47 +207,34 @@ def test_what_no_code_reads_of_a_class_may_change(monkeypatch):
 # What is no function of its arguments is refused in words, by every engine and on every path that flies it
 
 
-class Summing(nn.Module):
-    """A PI controller whose integral is a buffer."""
+class Odd(nn.Module):
+    """A policy that computes its command from the first observation x by a formula, and may remember."""
 
-    def __init__(self):
+    def __init__(self, formula):
         super().__init__()
-        self.gain = nn.Parameter(torch.ones(2, dtype=torch.float64))
+        self.gain, self.formula, self.last = nn.Parameter(torch.ones(1, dtype=torch.float64)), formula, 0.0
         self.register_buffer("integral", torch.zeros(1, dtype=torch.float64))
 
     def forward(self, observation):
-        self.integral += 0.1 * observation.detach().mean()
-        return (observation * self.gain).sum(-1, keepdim=True) + self.integral
+        return self.gain * self.formula(self, observation[..., :1])
 
-
-class Derivative(nn.Module):
-    """Takes the difference to the last observation."""
-
-    def __init__(self):
-        super().__init__()
-        self.gain, self.last = nn.Parameter(torch.ones(1, dtype=torch.float64)), 0.0
-
-    def forward(self, observation):
-        change, self.last = observation[..., :1] - self.last, observation[..., :1].detach().mean()
-        return self.gain * change
-
-
-class Random(Derivative):
-    def forward(self, observation):
-        return self.gain * observation[..., :1] + 0.1 * torch.rand(1, dtype=torch.float64)
-
-
-class Centred(Derivative):
-    def forward(self, observation):
-        return self.gain * (observation[..., :1] - observation[..., :1].mean())
+    def swapped(self, x):
+        last, self.last = self.last, x.detach().mean()
+        return last
 
 
 AGAIN = "gives something else when it is called again with the same arguments"
 POLICIES = {
     "recurrent": (Recurrent, rf"policy \(Recurrent\) {AGAIN}.*a state of the plant"),
-    "integral": (Summing, r"policy \(Summing\) changes its buffer 'integral'"),
-    "derivative": (Derivative, rf"policy \(Derivative\) {AGAIN}"),
-    "random": (Random, rf"policy \(Random\) {AGAIN}.*random numbers belong in draw_exogenous"),
+    "integral": (
+        lambda: Odd(lambda m, x: x + m.integral.add_(0.1 * x.detach().mean())),
+        r"policy \(Odd\) changes its buffer 'integral'",
+    ),
+    "derivative": (lambda: Odd(lambda m, x: x - m.swapped(x)), rf"policy \(Odd\) {AGAIN}"),
+    "random": (
+        lambda: Odd(lambda m, x: x + 0.1 * torch.rand(1, dtype=torch.float64)),
+        rf"policy \(Odd\) {AGAIN}.*random numbers belong in draw_exogenous",
+    ),
     "dropout": (
         lambda: Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)),
         rf"policy.layers.1 \(Dropout\) {AGAIN}.*\.eval\(\)",
@@ -256,7 +243,7 @@ POLICIES = {
         lambda: Rows(nn.BatchNorm1d(2), nn.Linear(2, 1)),
         r"policy.layers.0 \(BatchNorm1d\) changes its buffer 'running_mean'.*\.eval\(\)",
     ),
-    "mean over the batch": (Centred, "depends on the other realisations"),
+    "mean over the batch": (lambda: Odd(lambda m, x: x - x.mean()), "depends on the other realisations"),
 }
 PLANT = LinearQuadratic(horizon=1.0)
 

@@ -59,13 +59,11 @@ class LevenbergMarquardt:
     """
 
     least_damping, greatest_damping = 1e-12, 1e12
+    # Greatest change of a weight in one step; a change of 1 is a factor of e for a weight that is a logarithm. Far from
+    # the minimum, a longer step can end where the states no longer depend on the weight, and the weight would stay
+    # there. More damping shortens a step, because it takes from those combinations of weights that the record shows
+    # least; a shorter step in the same direction would take from all.
     longest_step = 1.0
-    """Greatest change of a weight in one step; a change of 1 is a factor of e for a weight that is a logarithm.
-
-    Far from the minimum, a longer step can end where the states no longer depend on the weight, and the weight would
-    stay there. More damping shortens a step, because it takes from those combinations of weights that the record shows
-    least; a shorter step in the same direction would take from all.
-    """
     least_step = 1e-9  # change of the weights below which they have arrived, whatever rounding is left of the cost
 
     def __init__(self, module: nn.Module, *, damping: float = 1e-3, tolerance: float = 1e-4):
