@@ -86,10 +86,8 @@ class _DiscreteAdjoint(torch.autograd.Function):
         jacobians = _jacobians(ctx.engine.intervals, ctx.interval, starts, drive)
         sources = marked_dynamic(plain(cost_gradient), 1)
         costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
-        wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
-        found = _products(ctx.engine.intervals, ctx.interval, starts, drive, weights, costates, wanted)
-        first = torch.einsum("bji,bj->bi", jacobians[0], costates[0]) if ctx.needs_input_grad[2] else None
-        return None, None, first, *found
+        found = _products(ctx.engine.intervals, ctx.interval, starts, drive, weights, costates)
+        return None, None, torch.einsum("bji,bj->bi", jacobians[0], costates[0]), *found
 
 
 def _products(
@@ -99,30 +97,25 @@ def _products(
     drive: Drive,
     weights: Sequence[Tensor],
     costates: Tensor,
-    wanted: Sequence[bool],
-) -> list[Tensor | None]:
-    """λᵀ∂Φ/∂x for t, z and a of every interval, and its sum over the intervals for every weight; None if not wanted.
+) -> list[Tensor]:
+    """λᵀ∂Φ/∂x for t, z and a of every interval, and its sum over the intervals for every weight.
 
     The products are computed in pieces, because the tape of an interval holds every unit of a perceptron.
     """
-    if not any(wanted):
-        return [None] * len(wanted)
     found = []
     for states, *driven, costate in _pieces(PIECE, starts, drive, costates.flatten(0, 1)):
-        driving = Drive(*map(plain, driven))
+        driving = [marked_dynamic(plain(x), 0).requires_grad_() for x in driven]
         with torch.enable_grad():
-            for x, need in zip(driving, wanted, strict=False):
-                marked_dynamic(x, 0).requires_grad_(need)
-            out = function(interval, marked_dynamic(plain(states), 0), driving)
-        leaves = [x for x, need in zip((*driving, *weights), wanted, strict=True) if need]
-        found.append(torch.autograd.grad(out, leaves, costate, allow_unused=True, materialize_grads=True))
-    gathered = iter(zip(*found, strict=True))
+            end = function(interval, marked_dynamic(plain(states), 0), Drive(*driving))
+        leaves = *driving, *weights
+        found.append(torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True))
+    t, exogenous, command, *of_weights = zip(*found, strict=True)
+    # t may be the same for all realisations
     of_drive = [
-        # t may be the same for all realisations
-        torch.cat(next(gathered)).unflatten(0, starts.shape[:2]).sum_to_size(x.shape) if need else None
-        for x, need in zip(drive, wanted, strict=False)
+        torch.cat(parts).unflatten(0, starts.shape[:2]).sum_to_size(x.shape)
+        for parts, x in zip((t, exogenous, command), drive, strict=True)
     ]
-    return of_drive + [sum(next(gathered)) if need else None for need in wanted[len(drive) :]]
+    return of_drive + [sum(parts, torch.zeros_like(parts[0])) for parts in of_weights]
 
 
 def _all_intervals(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
