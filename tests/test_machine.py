@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from relay import Relay
 from served_plants import free_port
+from tensordict import TensorDict
 from test_export_recipe import recipe
 from test_operation import QUIET
 
@@ -81,58 +81,44 @@ def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path
     assert (kept[-1, :, 1] <= kept[0, :, 1] + 2).all() and (kept[-1, :, 0] <= 1.1 * kept[0, :, 0]).all()
 
 
-class Learner:
-    """Steps 2 to 6 of a training whose real episode is over, over and over."""
-
-    def __init__(self):
-        from tensordict import TensorDict
-        from wind_turbine import DEFAULT
-
-        from rt_torchrl import DigitalTwin, ReinforcementTwinning
-        from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-
-        generator = torch.Generator().manual_seed(0)
-        self.plant = WindTurbine(horizon=25.0)
-        self.policies = {role: self.plant.make_policy(generator) for role in ("model_free", "model_based")}
-        twin = DigitalTwin(self.plant, self.plant.make_closure(generator))
-        env = PlantEnv(self.plant)
-        self.algorithm = ReinforcementTwinning(env, twin, **self.policies, config=DEFAULT, generator=generator)
-        self.episode = self.algorithm(TensorDict({"number": 0}))
-
-    def learn(self):
-        for name, step in self.algorithm.module.items():
-            if name != "interact":
-                step(self.episode)
-
-
-def lateness(operation, learner, seconds):
-    """Lateness of the intervals of a turn [ms], with a learner beside it or without."""
+def lateness(operation, learn, seconds):
+    """Lateness of the intervals of a turn [ms], with learning beside it or without."""
     end, late = time.monotonic() + seconds, []
     while operation.waiting():
         operation.rollout()  # windows that began before the turn
     operation.rollout()
     while time.monotonic() < end or not late:
-        if learner is not None:
-            learner.learn()
-            operation.hand_over("model_free", learner.policies["model_free"], strength=0.0)
-        while learner is None or operation.waiting():
+        if learn is not None:
+            learn()
+        while learn is None or operation.waiting():
             late.append(1e3 * operation.rollout()["late"].flatten().numpy())
-            if learner is None:
+            if learn is None:
                 break
     return np.concatenate(late)
 
 
-def test_the_period_is_kept_beside_learning_as_without():
-    recipe("wind_turbine")
-    learner, period = Learner(), 0.02
-    make_env, policies = partial(PlantEnv, learner.plant, seed=1), {"model_free": learner.policies["model_free"]}
-    options = OperationConfig(clock="wall", speed=learner.plant.dt / period, continuous=True)
-    operation = ProcessOperation(Crew(make_env, learner.plant, policies, QUIET, options, seed=0), make_env())
+def test_the_period_is_kept_beside_learning_as_without(tmp_path):
+    """Steps 2 to 6 of a training whose real episode is over are taken again and again."""
+    config = dataclasses.replace(recipe("wind_turbine").Config().defaults(), horizon=25.0, log_dir=tmp_path)
+    plant, period = config.plant(), 0.02
+    run = Run(config, plant, first=JonkmanController)
+    episode, policy = run.algorithm(TensorDict({"number": 0})), run.algorithm.policies["model_free"]
+    options = OperationConfig(clock="wall", speed=plant.dt / period, continuous=True)
+    crew = Crew(partial(PlantEnv, plant, seed=1), plant, {"model_free": policy}, QUIET, options, seed=0)
+    operation = ProcessOperation(crew, PlantEnv(plant, seed=1))
+
+    def learn():
+        for name, step in run.algorithm.module.items():
+            if name != "interact":
+                step(episode)
+        operation.hand_over("model_free", policy, strength=0.0)
+
     try:
-        operation.hand_over("model_free", policies["model_free"], strength=0.0)
-        late = {name: lateness(operation, beside, SECONDS / 4) for name, beside in (("idle", None), ("busy", learner))}
+        operation.hand_over("model_free", policy, strength=0.0)
+        late = {name: lateness(operation, beside, SECONDS / 4) for name, beside in (("idle", None), ("busy", learn))}
     finally:
         operation.close()
+        run._held.release()
     for name, times in late.items():
         print(name, len(times), *np.percentile(times, [50, 99, 100]).round(3), "missed", (times >= 1e3 * period).sum())
         assert np.median(times) < 2.0 and (times >= 1e3 * period).mean() < 0.1

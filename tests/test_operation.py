@@ -30,7 +30,7 @@ from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 QUIET = ExplorationConfig(episodes=0)
-NOISY = ExplorationConfig(episodes=3, spread=0.2)
+NOISY = ExplorationConfig(episodes=3, spread=0.2, correlation_time=0.5)
 
 
 class Stepped(PlantEnv):

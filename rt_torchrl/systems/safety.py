@@ -150,8 +150,6 @@ class Watchdog:
 
     def __init__(self, config: SafetyConfig):
         self.config = config
-        self._ends = {"out of range": _tensors(config.ranges), "limit": _tensors(config.limits)}
-        self._frozen = {entry: torch.as_tensor(count) for entry, count in config.frozen.items()}
         self._tolerance = config.clock_tolerance or TOLERANCE * config.interval
         self.begin()
 
@@ -173,15 +171,15 @@ class Watchdog:
         broken = [name for name, value in entries.items() if not value.isfinite().all()]
         if broken:
             faults["not finite"] = ", ".join(broken)
-        for kind, ends in self._ends.items():
-            outside = [name for name in ends if name in entries and not _inside(entries[name], ends[name])]
+        for kind, ranges in (("out of range", self.config.ranges), ("limit", self.config.limits)):
+            outside = [name for name, ends in ranges.items() if name in entries and not _inside(entries[name], ends)]
             if outside:
                 faults[kind] = ", ".join(outside)
         if self.config.clock is not None and (wrong := self._clock_fault(entries.get(self.config.clock))):
             faults["clock"] = wrong
         self.stale = 0
-        for entry, limit in self._frozen.items():
-            count = self._equal(entry, entries[entry], limit) if entry in entries else 0
+        for entry, limit in self.config.frozen.items():
+            count = self._equal(entry, entries[entry], torch.as_tensor(limit)) if entry in entries else 0
             if count:
                 faults["frozen"] = f"{entry}, {count} equal readings"
                 self.stale = max(self.stale, count - 2)
@@ -536,15 +534,8 @@ def _components(mask: Tensor) -> str:
     return "action " + ", ".join(map(str, mask.flatten().nonzero().flatten().tolist()))
 
 
-def _tensors(ranges: Mapping[str, Range]) -> dict[str, tuple[Tensor, Tensor]]:
-    def ends(low: Any, high: Any) -> tuple[Tensor, Tensor]:
-        return torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)
-
-    return {entry: ends(*given) for entry, given in ranges.items()}
-
-
-def _inside(value: Tensor, ends: tuple[Tensor, Tensor]) -> bool:
-    low, high = (end.to(value) for end in ends)
+def _inside(value: Tensor, ends: Range) -> bool:
+    low, high = (torch.as_tensor(end, dtype=value.dtype, device=value.device) for end in ends)
     # A value that is not finite is a fault of its own.
     return bool(((value >= low) & (value <= high) | ~value.isfinite()).all())
 

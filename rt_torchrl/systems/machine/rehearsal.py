@@ -36,13 +36,13 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.systems.config import SafetyConfig
+from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.machine.connected_plant import ConnectedPlant, Link
 from rt_torchrl.systems.machine.modbus import ModbusLink, Register
 from rt_torchrl.systems.machine.opc_ua import OpcUaLink
 from rt_torchrl.systems.operation.process import end_process
 from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.trajectories.rollout import DivergenceError
 
 HOST = "127.0.0.1"
 """Address of the server, which is on this machine."""
@@ -93,16 +93,14 @@ class ServedPlant:
     """
 
     def __init__(self, plant: Plant, safe: Sequence[float], *, seed: int = 0):
-        self.plant = plant
+        self.plant, self._env = plant, PlantEnv(plant, seed=seed)
         self._low, self._high = bounds(plant.actions)
         self._safe = torch.tensor(tuple(safe), dtype=torch.float64)
         if self._safe.shape != self._low.shape or not self._valid(self._safe):
             ranges = [(action.name, action.low, action.high) for action in plant.actions]
             raise ValueError(f"safe={tuple(safe)} must be one number within the range of each action, {ranges}.")
-        self._generator = torch.Generator().manual_seed(seed)
-        self._state = plant.draw_initial_state(1, self._generator)
-        self._inputs = plant.draw_exogenous(1, self._generator)
-        self._applied = torch.zeros(1, len(plant.actions), dtype=torch.float64)
+        self._reported = self._env.reset()
+        self._applied = self._reported["applied"]
         self.sample, self.missed, self.safe = 0, 0, True
 
     def _valid(self, command: Tensor) -> bool:
@@ -110,12 +108,10 @@ class ServedPlant:
 
     def published(self) -> dict[str, float]:
         """All tags that a client reads, at the beginning of the interval."""
-        plant, k = self.plant, self.sample % self.plant.n_steps
-        vectors = self._state[0, : len(plant.readings)], self._inputs[0, k], self._applied[0]
+        vectors = self._reported["state"], self._reported["exogenous"], self._applied
         own = [float(self.sample), float(self.safe), float(self.missed)]
-        return dict(zip(read_tags(plant), own + torch.cat(vectors).tolist(), strict=True))
+        return dict(zip(read_tags(self.plant), own + torch.cat(vectors, -1)[0].tolist(), strict=True))
 
-    @torch.no_grad()
     def advance(self, answered: float, command: Sequence[float]) -> None:
         """Run to the end of the interval.
 
@@ -130,14 +126,10 @@ class ServedPlant:
         self.safe = not (answered == self.sample and self._valid(acting))
         self.missed += self.safe
         acting = self._safe if self.safe else acting
-        plant, k = self.plant, self.sample % self.plant.n_steps
-        t = torch.full((1,), k * plant.dt, dtype=torch.float64)
-        self._state, self._applied = plant.step(t, self._state, acting[None], self._inputs[:, k], plant.closure)
-        if not math.isfinite(self._state.sum()):
-            raise DivergenceError(f"plant {plant.name!r} diverged at sample {self.sample}.")
-        self.sample += 1
-        if self.sample % plant.n_steps == 0:
-            self._inputs = plant.draw_exogenous(1, self._generator)
+        self._reported = self._env.step(self._reported.set("action", acting[None]))["next"].exclude("reward")
+        self._applied, self.sample = self._reported["applied"], self.sample + 1
+        if self.sample % self.plant.n_steps == 0:
+            self._reported = self._env.go_on()
 
 
 # Servers that show the tags
