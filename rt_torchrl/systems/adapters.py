@@ -14,11 +14,10 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.environment import ForeignSystem
 
 Report = Mapping[str, np.ndarray | Sequence[float]]
 Controller = Callable[[Report], np.ndarray]
@@ -31,7 +30,7 @@ class EpisodeAbandoned(BaseException):
     """Ends an episode that nobody goes on with; it is raised where the simulator calls its controller."""
 
 
-class CallingSimulator(EnvBase):
+class CallingSimulator(ForeignSystem):
     """An environment around a simulator that runs whole episodes itself and calls a controller in them.
 
     Co-simulation, Bladed-style controller libraries and many course codes work like this: ``simulate(seed,
@@ -62,17 +61,9 @@ class CallingSimulator(EnvBase):
     def __init__(self, simulate: Simulation, reports: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
         if not reports or not actions:
             raise ValueError(f"reports={dict(reports)} and actions={list(actions)} must not be empty.")
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self._simulate, self._sizes, self._seed = simulate, dict(reports), seed
+        super().__init__(reports, actions, seed=seed)
+        self._simulate, self._sizes = simulate, dict(reports)
         self._conversation: _Conversation | None = None
-        double = {"dtype": torch.float64}
-        self.observation_spec = Composite({name: Unbounded((n,), **double) for name, n in self._sizes.items()})
-        low, high = bounds(actions)
-        self.action_spec = Bounded(low, high, (len(actions),), **double)
-        self.reward_spec = Unbounded((1,), **double)
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._seed = self._seed if seed is None else seed
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self.end_episode()
@@ -94,9 +85,7 @@ class CallingSimulator(EnvBase):
         reported = self._conversation.listen()
         if reported is not None:
             self._last = self._entries(reported)
-        ended = torch.full((1,), reported is None)
-        ends = {"done": ended, "terminated": ended.clone(), "reward": torch.zeros(1, dtype=torch.float64)}
-        return self._last.clone().update(ends)
+        return self._stepped(self._last.clone(), ended=reported is None)
 
     def _entries(self, reported: Report) -> TensorDict:
         entries: dict[str, Tensor] = {}
@@ -194,7 +183,7 @@ class FMUError(RuntimeError):
     """The FMU has refused a call; the message names the FMU, the call and the time."""
 
 
-class FMUEnvironment(EnvBase):
+class FMUEnvironment(ForeignSystem):
     """One FMU that is stepped once in a control interval; it reports ``outputs`` and ``exogenous``.
 
     :class:`RealSystem` makes it the real system of a plant, with ``state=Reading(keys=("outputs",))`` and
@@ -215,8 +204,6 @@ class FMUEnvironment(EnvBase):
         FMUError: in a reset or step that the FMU refuses.
     """
 
-    observation_spec: Composite
-
     def __init__(
         self,
         path: Path | str,
@@ -228,7 +215,7 @@ class FMUEnvironment(EnvBase):
         start: Start | None = None,
         seed: int = 0,
     ):
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        super().__init__({"outputs": len(outputs), "exogenous": len(plant.inputs)}, plant.actions, seed=seed)
         self._fmpy, self.path, self.plant = _fmpy(), Path(path), plant
         self._description, self._places = self._read()
         if len(actions) != len(plant.actions):
@@ -238,16 +225,9 @@ class FMUEnvironment(EnvBase):
             raise ValueError(f"exogenous={tuple(exogenous)} must name {len(plant.inputs)} variables, or none.")
         self._require({"actions": actions, "outputs": outputs, "exogenous": exogenous})
         self._actions, self._outputs, self._exogenous = tuple(actions), tuple(outputs), tuple(exogenous)
-        self._start, self._seed, self._steps = start, seed, 0
+        self._start, self._steps = start, 0
         self._fmu: Any = None  # FMPy says no types
         self._folder = self._fmpy.extract(str(self.path))
-        double = {"dtype": torch.float64}
-        reported = {"outputs": Unbounded((len(outputs),), **double)}
-        reported["exogenous"] = Unbounded((len(plant.inputs),), **double)
-        self.observation_spec = Composite(reported)
-        low, high = bounds(plant.actions)
-        self.action_spec = Bounded(low, high, (len(actions),), **double)
-        self.reward_spec = Unbounded((1,), **double)
 
     def _read(self) -> tuple[Any, dict[str, int]]:
         try:
@@ -271,9 +251,6 @@ class FMUEnvironment(EnvBase):
                     f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "
                     f"{', '.join(self._places)}."
                 )
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._seed = self._seed if seed is None else seed
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         generator = torch.Generator().manual_seed(self._seed)
@@ -303,8 +280,7 @@ class FMUEnvironment(EnvBase):
         t, dt = self._steps * self.plant.dt, self.plant.dt
         self._call("doStep", partial(self._fmu.doStep, currentCommunicationPoint=t, communicationStepSize=dt))
         self._steps += 1
-        ends = {"done": torch.zeros(1, dtype=torch.bool), "terminated": torch.zeros(1, dtype=torch.bool)}
-        return self._report().update(ends | {"reward": torch.zeros(1, dtype=torch.float64)})
+        return self._stepped(self._report())
 
     def _set(self, values: Mapping[str, float]) -> None:
         if values:

@@ -255,31 +255,24 @@ def flown(
     """
     ends = plant.ended(states[1:]).any(-1)
     n = int(ends.int().argmax()) + 1 if ends.any() else len(command)
-    states, command, drive, factors = (
-        states[: n + 1],
-        command[:n],
-        Drive(*(values[:n] for values in drive)),
-        factors[: n + 1],
-    )
-    over = ends[n - 1 : n].unsqueeze(-1)
+    states, factors, command = states[: n + 1], factors[: n + 1], command[:n]
+    drive, over = Drive(*(values[:n] for values in drive)), ends[n - 1]
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
-    reward[-1] -= ~ends[n - 1] * plant.terminal_cost(states[-1]) / plant.dt
+    reward[-1] -= ~over * plant.terminal_cost(states[-1]) / plant.dt
     # There is no input after the last interval; the last input takes its place.
     exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
-    truncated = torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)
-    truncated[-1] = ~over
     felt = states * factors
     seen = {"state": felt[..., : len(plant.readings)], "exogenous": exogenous}
     seen["observation"] = plant.observe(t, felt, exogenous)
     seen["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])
-    never = torch.zeros_like(truncated)
-    terminal = never.clone()
-    terminal[-1] = over
-    ended = {"reward": reward.unsqueeze(-1), "done": truncated | terminal, "truncated": truncated}
-    ended["terminated"] = terminal
-    begun = {key: never.clone() for key in ("done", "truncated", "terminated")}
+    begun = {
+        key: torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)
+        for key in ("done", "truncated", "terminated")
+    }
+    ended = {key: never.clone() for key, never in begun.items()} | {"reward": reward.unsqueeze(-1)}
+    ended["done"][-1], ended["truncated"][-1], ended["terminated"][-1] = True, ~over, over
     return TensorDict(
         {key: value[:-1] for key, value in seen.items()}
         | begun

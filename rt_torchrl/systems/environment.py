@@ -1,6 +1,6 @@
 """The real system in simulation: any plant as a TorchRL environment, and environments around systems."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from rt_torchrl.options import OTHER_UNITS, require_number
 from rt_torchrl.plants.plant import Plant, Transition, with_memories
-from rt_torchrl.plants.signal import bounds
+from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.engines.parallel import compiled_if
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -251,6 +251,34 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
     env.reward_spec = unbounded(1)
     flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
     env.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device)
+
+
+class ForeignSystem(EnvBase):
+    """One system without a batch that somebody else makes: it reports vectors by name, and its rewards are zero.
+
+    Args:
+        sizes: number of components of each vector.
+        actions: signals of the actions; their ranges become those of the environment's action.
+        seed: seed of the first episode, until ``set_seed`` gives another.
+    """
+
+    def __init__(self, sizes: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        double = {"dtype": torch.float64}
+        self.observation_spec = Composite({name: Unbounded((n,), **double) for name, n in sizes.items()})
+        low, high = bounds(tuple(actions))
+        self.action_spec = Bounded(low, high, (len(actions),), **double)
+        self.reward_spec = Unbounded((1,), **double)
+        self._seed = seed
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = self._seed if seed is None else seed
+
+    def _stepped(self, reported: TensorDict, *, ended: bool = False) -> TensorDict:
+        """What a step returns, made of what the system reports at its end."""
+        done = torch.full((1,), ended)
+        ends = {"done": done, "terminated": done.clone(), "reward": torch.zeros(1, dtype=torch.float64)}
+        return reported.update(ends)
 
 
 def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:

@@ -8,11 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.environment import ForeignSystem
 from rt_torchrl.systems.operation.operator import Pace
 
 FRESH = 0.5
@@ -92,7 +91,7 @@ class Link(Protocol):
         """Close the connection, if there is one."""
 
 
-class ConnectedPlant(EnvBase):
+class ConnectedPlant(ForeignSystem):
     """An environment around a :class:`Link`: it writes commands, waits for the next sample, and reads.
 
     The plant's clock is the master: where a tag counts samples, the client follows it, and a reading that is no newer
@@ -151,7 +150,7 @@ class ConnectedPlant(EnvBase):
             raise ValueError(f"patience={patience} s must be positive; infinity waits for ever.")
         if answered is not None and sample is None:
             raise ValueError(f"answered={answered!r} takes the number of a sample; name the tag that counts, sample.")
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        super().__init__({key: len(tags) for key, tags in entries.items()} | {"skipped": 1}, actions)
         self.link, self.pace = link, Pace(period, clock=clock, sleep=sleep)
         self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
         self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
@@ -166,15 +165,6 @@ class ConnectedPlant(EnvBase):
         self._refused: Exception | None = None  # what the plant has refused, or the link has failed at, beside the loop
         self._mender: threading.Thread | None = None
         self._lock = threading.Lock()  # connection and mender change together
-        double = {"dtype": torch.float64}
-        sizes = {key: len(tags) for key, tags in entries.items()} | {"skipped": 1}
-        self.observation_spec = Composite({key: Unbounded((n,), **double) for key, n in sizes.items()})
-        low, high = bounds(tuple(actions))
-        self.action_spec = Bounded(low, high, (len(actions),), **double)
-        self.reward_spec = Unbounded((1,), **double)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Do nothing, because a machine takes no seed."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Connect, if there is no connection, and wait for a sample."""
@@ -213,8 +203,7 @@ class ConnectedPlant(EnvBase):
         reading = self._fresh() if self._connected else None
         if not through:
             reading, self.reasons = None, {"commands": f"not written: {self._lost}"}
-        ends = {"done": torch.zeros(1, dtype=torch.bool), "reward": torch.zeros(1, dtype=torch.float64)}
-        return self._entries(reading).update(ends)
+        return self._stepped(self._entries(reading))
 
     def _written(self, values: Mapping[str, float]) -> bool:
         """Write the commands; whether they got through."""

@@ -8,7 +8,7 @@ import sys
 import threading
 from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 import torch
@@ -185,36 +185,22 @@ def _operate(crew: Crew, state: dict[str, Any] | None, orders: SimpleQueue[Any],
     try:
         if state is not None:
             operator.load_state_dict(state)
-        order = _sound(orders.get())
+        order = orders.get()
         gc.collect()
         gc.freeze()  # a collection of all objects that the libraries have made would stop an action
         while order != STOP:
+            if isinstance(order, Exception):  # of the receiving thread
+                raise order
             if order is not None:
                 operator.follow(*order)
-            window = operator.step()
-            if window is not None:
-                windows.put(("window", window, operator.state_dict()))
-            order = _next(orders)
-            while order is not None and order != STOP and not orders.empty():
-                operator.follow(*order)
-                order = _next(orders)
+            if orders.empty():  # otherwise the next order comes at once
+                window = operator.step()
+                if window is not None:
+                    windows.put(("window", window, operator.state_dict()))
+            order = None if orders.empty() else orders.get()
     finally:
         gc.unfreeze()  # otherwise libraries report at the end of the process what nobody has freed
         operator.env.close()
-
-
-def _next(orders: SimpleQueue[Any]) -> Any:
-    try:
-        return _sound(orders.get_nowait())
-    except Empty:
-        return None
-
-
-def _sound(order: Any) -> Any:
-    """What the receiving thread has put into the queue, or raise its error."""
-    if isinstance(order, Exception):
-        raise order
-    return order
 
 
 def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[str, nn.Module]) -> None:
