@@ -52,9 +52,7 @@ def guarded(*injections, plant=None, **options):
 
 def algorithm(env, **changes):
     changes = {"referee": RefereeConfig(rule="decision_tree")} | changes
-    parts = twinning(LinearQuadratic(horizon=DT * N), **changes)
-    generator = torch.Generator().manual_seed(0)
-    return ReinforcementTwinning(env, parts.twin, config=parts.config, generator=generator, **parts.policies)
+    return twinning(LinearQuadratic(horizon=DT * N), env=env, **changes)
 
 
 def require_true(plant, record, *, rtol=0.0, atol=1e-12):

@@ -6,19 +6,17 @@ import math
 import os
 
 import pytest
+import test_algorithm
 import torch
 from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from test_faults import require_true
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, TwinningConfig
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
@@ -27,7 +25,6 @@ from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.systems.sound_part import EpisodeEndedError
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 QUIET = ExplorationConfig(episodes=0)
 NOISY = ExplorationConfig(episodes=3, spread=0.2, correlation_time=0.5)
@@ -37,33 +34,19 @@ class Stepped(PlantEnv):
     """A subclass, which is flown step by step as an operation is."""
 
 
-def small(exploration):
-    return TwinningConfig(
-        realisations=2,
-        virtual_episodes=3,
-        exploration=exploration,
-        learner=LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
-        assimilation=AssimilationConfig(iterations=2),
-        planner=PlannerConfig(iterations=2, descent=DescentConfig(rate=0.01)),
-    )
-
-
-def twinning(system, *, seed=0, exploration=QUIET, **options):
-    """A training; ``system`` makes the real system, or the operation of one, of plant and policies."""
-    plant = LinearQuadratic(horizon=2.0)
-    generator = torch.Generator().manual_seed(seed)
+def twinning(system, exploration=QUIET):
+    """A training; ``system`` makes the real system, or the operation of one, of plant, policies and exploration."""
+    plant, generator = LinearQuadratic(horizon=2.0), torch.Generator().manual_seed(0)
     policies = {role: plant.make_policy(generator) for role in ("model_free", "model_based")}
-    twin = DigitalTwin(plant, plant.make_closure(generator))
-    config = small(exploration)
-    env = system(plant, policies, config)
-    return ReinforcementTwinning(env, twin, **policies, config=config, generator=generator, **options)
+    env = system(plant, policies, exploration)
+    return test_algorithm.twinning(plant, env=env, **policies, exploration=exploration, learner=test_algorithm.LEARNING)
 
 
 def operation_of(log=None, learning=10, kind=PlantEnv, **options):
     """A function that makes the operation of a plant in simulation."""
 
-    def made(plant, policies, config):
-        crew = Crew(lambda: kind(plant), plant, policies, config.exploration, OperationConfig(**options), seed=7)
+    def made(plant, policies, exploration):
+        crew = Crew(lambda: kind(plant), plant, policies, exploration, OperationConfig(**options), seed=7)
         return SimulatedOperation(crew.operator(), learning=learning, log=log)
 
     return made
@@ -82,7 +65,7 @@ def trained(system, episodes=4, **options):
 
 def test_learning_in_no_time_is_the_synchronous_run_to_the_bit():
     ahead, reports = trained(operation_of(learning=0, kind=Stepped))
-    plain, expected = trained(lambda plant, policies, config: Stepped(plant))
+    plain, expected = trained(lambda plant, policies, exploration: Stepped(plant))
     assert torch.equal(weights(ahead), weights(plain))
     for one, other in zip(reports, expected, strict=True):
         assert one["real_cost"] == other["real_cost"] and one["live"] == other["live"] and one["windows"] == 1.0
@@ -134,7 +117,7 @@ class Constant(torch.nn.Module):
 def handed_over(plant, before, after, at, *, handover=20):
     """The commands of a window in which one constant policy takes over from another one."""
     policies = {"before": before, "after": after}
-    operation = operation_of(learning=at - plant.n_steps, handover=handover)(plant, policies, small(QUIET))
+    operation = operation_of(learning=at - plant.n_steps, handover=handover)(plant, policies, QUIET)
     operation.hand_over("before", before, strength=0.0)
     operation.rollout()
     operation.hand_over("after", after, strength=0.0)

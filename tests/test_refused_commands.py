@@ -11,7 +11,7 @@ import torch
 from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from served_plants import free_port, in_a_thread
-from test_real_flights import HORIZON, algorithm
+from test_algorithm import twinning
 from test_real_system import connected
 from test_safety import Clock, Failing, failing, fly, layer
 from test_served import ENTRIES, PLANT, Line, Time
@@ -150,25 +150,10 @@ def test_a_reading_that_is_not_good_is_missing_and_named_and_the_connection_stay
     system.close()
 
 
-class Unreliable(Line):
-    """A line whose requests fail where the test says so, to a plant that does not report what it has applied."""
-
-    def __init__(self, time, period):
-        super().__init__(time, period)
-        self.fails_at, self.error, self.writes = set(), None, 0
-
-    def write(self, values):
-        self.writes += 1
-        if self.writes in self.fails_at:
-            raise self.error
-        super().write(values)
-
-
 @pytest.mark.parametrize("error", [LateAnswerError("busy"), LinkLostError("cut")])
 def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error):
     """The machine holds its last command then, or its safe one; the record would say that it had the new one."""
-    line = Unreliable(Time(), 0.1)
-    line.fails_at, line.error = {6}, error
+    line = Line(Time(), 0.1, fails={("write", 6): error})
     entries = {key: ENTRIES[key] for key in ("state", "exogenous")}
     client = client_of(line, entries=entries)
     layer = SafetyLayer(client, SafetyConfig(interval=0.1), fallback=(0.0,))
@@ -212,25 +197,8 @@ def test_a_client_that_cannot_be_made_now_is_a_lost_connection_and_is_made_at_th
         link.close()
 
 
-class Failed(Line):
-    """A line that is cut once; the next attempt to connect fails at a mistake, and those after it do not."""
-
-    cut = True
-
-    def write(self, values):
-        if self.cut:
-            self.cut = False
-            raise LinkLostError("cut")
-        super().write(values)
-
-    def connect(self):
-        super().connect()
-        if self.connections == 2:
-            raise KeyError("cert.pem")
-
-
 def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_next_reset_connects():
-    line = Failed(Time(), 0.1)
+    line = Line(Time(), 0.1, fails={("write", 1): LinkLostError("cut"), ("connect", 2): KeyError("cert.pem")})
     env = client_of(line)
     row, action = env.reset(), torch.tensor([1.0]).double()
     row = env.step(row.set("action", action))["next"]
@@ -239,7 +207,7 @@ def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_ne
     with pytest.raises(KeyError, match=r"cert\.pem"):
         env.step(row.set("action", action))
     row = env.reset()
-    assert line.connections == 3 and env.step(row.set("action", action))["next", "state"].isfinite().all()
+    assert line.requests["connect"] == 3 and env.step(row.set("action", action))["next", "state"].isfinite().all()
     env.close()
 
 
@@ -366,8 +334,8 @@ def stored(found):
     ],
 )
 def test_an_episode_with_a_refused_reading_is_flown_again(value, options, reason):
-    plant = LinearQuadratic(horizon=HORIZON)
-    found = algorithm(layer(Spiky(plant, value, episodes=2), **options))
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(env=layer(Spiky(plant, value, episodes=2), **options))
     report = found.episode()
     assert report["episodes_refused"] == 2 and len(found.env.reports) == 3
     assert re.search(reason, report["refusal"])
@@ -378,7 +346,7 @@ def test_an_episode_with_a_refused_reading_is_flown_again(value, options, reason
 
 
 def test_a_real_system_passes_the_refusals_of_its_layer_on():
-    plant = LinearQuadratic(horizon=HORIZON)
+    plant = LinearQuadratic(horizon=2.0)
     guarded = failing(broken=[3, 4], value=1e5, **RANGES)
     readings = {"state": Reading(keys=("state",)), "exogenous": Reading(keys=("exogenous",))}
     system = RealSystem(guarded, plant, applied=Reading(keys=("applied",)), actuation=Actuation(), **readings)
@@ -397,15 +365,15 @@ class Worthless(PlantEnv):
 
 def test_a_reward_is_no_reading():
     """A bad reward trips nothing: a real system does not use it, and where it is used the episode is refused."""
-    plant = LinearQuadratic(horizon=HORIZON)
+    plant = LinearQuadratic(horizon=2.0)
     env = layer(Worthless(plant))
     assert fly(env, [0.5] * 20)["next", "applied"].eq(0.5).all() and not env.report.events
     with pytest.raises(ValueError, match=r"3 real episodes in a row .*\('next', 'reward'\) holds nan"):
-        algorithm(env).episode()
+        twinning(env=env).episode()
 
 
 def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
-    plant, dropped = LinearQuadratic(horizon=HORIZON), Injection("dropped", 2, 19, episode=0)
+    plant, dropped = LinearQuadratic(horizon=2.0), Injection("dropped", 2, 19, episode=0)
     env = layer(FaultySystem(PlantEnv(plant), [dropped], interval=plant.dt))
     episode = fly(env, [0.5] * 20)
     assert episode["next", "refused"].flatten().nonzero().flatten().tolist() == list(range(2, 20))
@@ -414,7 +382,7 @@ def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
 
 
 def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():
-    found = algorithm(PlantEnv(LinearQuadratic(horizon=HORIZON)))
+    found = twinning()
     for weight in found.learner.critic_adam.weights:
         weight.data.fill_(NAN)
     with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):

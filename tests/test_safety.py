@@ -13,7 +13,6 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv, GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.systems.config import SafetyConfig
@@ -181,11 +180,8 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
 
 def test_reinforcement_twinning_learns_from_what_was_applied():
     plant = LinearQuadratic(horizon=2.0)
-    parts = twinning(plant)
     env = layer(PlantEnv(plant, seed=0), rates=(1.0,), rest=(0.0,))
-    found = ReinforcementTwinning(
-        env, parts.twin, config=parts.config, generator=torch.Generator().manual_seed(0), **parts.policies
-    )
+    found = twinning(plant, env=env)
     report = found.episode()
     assert report["J_p"].isfinite() and env.report.counts["rate"] > 0 and len(env.reports) == 1
     record = found.short_term[-1]

@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 import time
+from collections import Counter
 
 import pytest
 import torch
@@ -82,29 +83,31 @@ class Time:
 
 
 class Line:
-    """A link to a served plant on a simulated clock, which is down between some times [s]."""
+    """A link to a served plant on a simulated clock: down between some times [s], or failing at numbered requests."""
 
-    def __init__(self, time, period, down=()):
-        self.time, self.period, self.down, self.connections = time, period, down, 0
+    def __init__(self, time, period, down=(), fails=None):
+        self.time, self.period, self.down, self.fails, self.requests = time, period, down, fails or {}, Counter()
         self.plant = ServedPlant(PLANT, (0.0,))
         self.answer = {"answered": math.nan, "command.force": math.nan}
 
-    def _up(self):
+    def _up(self, request):
+        self.requests[request] += 1
+        if (request, self.requests[request]) in self.fails:
+            raise self.fails[request, self.requests[request]]
         while (self.plant.sample + 1) * self.period <= self.time.now + 1e-12:
             self.plant.advance(self.answer["answered"], [self.answer["command.force"]])
         if any(begin <= self.time.now < end for begin, end in self.down):
             raise LinkLostError("down")
 
     def connect(self):
-        self._up()
-        self.connections += 1
+        self._up("connect")
 
     def read(self):
-        self._up()
+        self._up("read")
         return self.plant.published()
 
     def write(self, values):
-        self._up()
+        self._up("write")
         self.answer = dict(values)
 
     def close(self):
@@ -118,20 +121,12 @@ def connected(line, entries=ENTRIES, **options):
     )
 
 
-def steps(env, count, command=1.0):
-    row, found = env.reset(), []
-    for _ in range(count):
-        row = env.step(row.set("action", torch.tensor([command]).double()))["next"]
-        found.append(row)
-    return found
-
-
 def test_a_client_answers_every_sample_of_the_plant():
     line = Line(Time(), 0.1)
     env = connected(line)
-    found = steps(env, 50)
+    found = env.rollout(50, lambda td: td.set("action", torch.ones(1).double()))
     assert line.plant.missed == 0 and env.losses == env.stale == env.skipped == 0
-    assert all(row["applied"].item() == 1.0 for row in found)
+    assert (found["next", "applied"] == 1.0).all()
     assert line.time.now == pytest.approx(5.0, rel=0.02)
 
 

@@ -80,7 +80,8 @@ class WiringError(ValueError):
 class Flown(NamedTuple):
     """Control intervals of short flights, as they were read or as a mistake would have them; ``n`` rows each.
 
-    ``earlier`` holds action and input of the interval before, and ``ratio`` the real control interval by the plant's.
+    The earlier actions and inputs are those of the interval before; ``ratio`` is the real control interval by the
+    plant's.
     """
 
     t: Float[Tensor, " n"]
@@ -88,7 +89,8 @@ class Flown(NamedTuple):
     actions: Float[Tensor, "n n_a"]
     exogenous: Float[Tensor, "n n_z"]
     ends: Float[Tensor, "n n_s"]
-    earlier: tuple[Tensor, Tensor]
+    earlier_actions: Float[Tensor, "n n_a"]
+    earlier_exogenous: Float[Tensor, "n n_z"]
     ratio: float = 1.0
 
 
@@ -186,8 +188,8 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
     before = (rows - 1).clamp(min=0)
     t = float(record.start) + plant.dt * rows.double()
     states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
-    earlier = actions[before], exogenous[before]
-    return _checked(Flown(t, states[rows], actions[rows], exogenous[rows], states[rows + 1], earlier), plant, closure)
+    now, earlier = (actions[rows], exogenous[rows]), (actions[before], exogenous[before])
+    return _checked(Flown(t, states[rows], *now, states[rows + 1], *earlier), plant, closure)
 
 
 def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
@@ -238,7 +240,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
     """The sound intervals of a few short flights."""
     noise = ExplorationConfig(spread=spread, correlation_time=CORRELATION * plant.dt)
     live = LivePolicy(plant, policy, noise, generator=generator).to(env.device)
-    rows: list[Flown] = []
+    rows: list[tuple[Tensor, ...]] = []
     kept = env.state_dict()
     try:
         for _ in range(STARTS):
@@ -249,7 +251,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
                 after, t = row["next"], row["state"].new_full((1,), k * plant.dt)
                 now = after["applied"].clone(), row["exogenous"].clone()
                 if not any("refused" in reading and reading["refused"].any() for reading in (row, after)):
-                    rows.append(Flown(t, row["state"].clone(), *now, after["state"].clone(), earlier or now))
+                    rows.append((t, row["state"].clone(), *now, after["state"].clone(), *(earlier or now)))
                 if after["done"].any():
                     break
                 row, earlier = env.step_mdp(row), now
@@ -257,11 +259,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
         env.load_state_dict(kept)
     if not rows:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    t, states, actions, exogenous, ends = (
-        torch.cat(parts).cpu() for parts in zip(*(row[:5] for row in rows), strict=True)
-    )
-    before = (torch.cat([row.earlier[k] for row in rows]).cpu() for k in (0, 1))
-    return Flown(t, states, actions, exogenous, ends, (next(before), next(before)))
+    return Flown(*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)))
 
 
 def _movement(plant: Plant, flown: Flown) -> Float[Tensor, "n n_s"]:
@@ -365,9 +363,9 @@ def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
             yield f"{what}s {signals[k].name} and {signals[m].name} are in the other order", flown._replace(**swapped)
     for ratio in RATIOS:
         yield f"dt is another one, {ratio * plant.dt:g} s and not {plant.dt:g} s", flown._replace(ratio=ratio)
-    yield "an action acts one interval late", flown._replace(actions=flown.earlier[0])
+    yield "an action acts one interval late", flown._replace(actions=flown.earlier_actions)
     if plant.inputs:
-        yield "an input is read one interval late", flown._replace(exogenous=flown.earlier[1])
+        yield "an input is read one interval late", flown._replace(exogenous=flown.earlier_exogenous)
     for k, signal in enumerate(plant.actions):
         for level in torch.linspace(signal.low, signal.high, LEVELS).tolist():
             constant = _changed(flown, ("actions",), k, 0.0, level)
