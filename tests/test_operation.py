@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import multiprocessing
 import os
 
 import pytest
@@ -343,6 +344,24 @@ def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_
         with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
             found.rollout()
         assert raised.value.flown.shape == (1, 4) and found.rollout().shape == (1, 10)
+    finally:
+        found.close()
+
+
+@pytest.mark.slow
+def test_an_acting_process_that_was_killed_is_said():
+    found, policies = operation()
+    try:
+        found.hand_over("one", policies["one"], strength=0.0)
+        found.rollout()
+        (process,) = multiprocessing.active_children()
+        process.kill()
+        process.join()
+        with pytest.raises(RuntimeError, match="the acting process has ended without a word"):
+            while True:  # windows that came before
+                found.rollout()
+        with pytest.raises(RuntimeError, match="the acting process has ended without a word"):
+            found.hand_over("two", policies["two"], strength=0.0)
     finally:
         found.close()
 

@@ -259,7 +259,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
         env.load_state_dict(kept)
     if not rows:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    return Flown(*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)))
+    return Flown._make([*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)), 1.0])
 
 
 def _movement(plant: Plant, flown: Flown) -> Float[Tensor, "n n_s"]:

@@ -64,8 +64,9 @@ class ProcessOperation(Operation):
         connection = self._begun()
         try:
             connection.send_bytes(pickle.dumps(order))
-        except OSError as error:
-            raise RuntimeError(self._failure()) from error
+        except OSError:
+            while True:
+                self._received(connection)  # after the windows, what the process has said at its end is raised
 
     def _begun(self) -> Connection:
         """The connection to the acting process, which is started where there is none."""
@@ -89,27 +90,20 @@ class ProcessOperation(Operation):
         connection = self._begun()
         while not connection.poll(LOOK):
             safe_point()
-        try:
-            kind, *parts = pickle.loads(connection.recv_bytes())
-        except (EOFError, OSError) as error:
-            raise RuntimeError(self._failure()) from error
-        if kind == "failed":
-            raise RuntimeError(f"the acting process has failed: {parts[0]}")
-        window, self._state = parts
+        window, self._state = self._received(connection)
         assert self._state is not None
         self.system.load_state_dict(self._state["env"])
         return self._take(window, self._state["order"]["version"])
 
-    def _failure(self) -> str:
-        """What an acting process that does not answer has said, as far as it has."""
+    def _received(self, connection: Connection) -> list[Any]:
+        """The next window of the acting process, and its state; an error where it has failed or ended."""
         try:
-            while self._connection is not None and self._connection.poll():
-                kind, *parts = pickle.loads(self._connection.recv_bytes())
-                if kind == "failed":
-                    return f"the acting process has failed: {parts[0]}"
-        except (EOFError, OSError):
-            pass
-        return "the acting process has ended without a word; it may have been killed."
+            kind, *parts = pickle.loads(connection.recv_bytes())
+        except (EOFError, OSError) as error:
+            raise RuntimeError("the acting process has ended without a word; it may have been killed.") from error
+        if kind == "failed":
+            raise RuntimeError(f"the acting process has failed: {parts[0]}")
+        return parts
 
     def close(self) -> None:
         if self._process is None or self._connection is None:
