@@ -20,6 +20,7 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
+from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
 from rt_torchrl.steps.plan import MakePlan, make_planner
 from rt_torchrl.steps.switch import make_referee
@@ -29,7 +30,8 @@ from rt_torchrl.trajectories.trajectory import identification_cost
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
-    metrics = small_run(tmp_path, figures=True).train()
+    metrics = small_run(tmp_path, figures=True, checkpoints=2).train()
+    assert {path.name for path in tmp_path.glob("checkpoint*")} == {"checkpoint.pt", "checkpoint-0002.pt"}
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert [record["episode"] for record in metrics["episodes"]] == [0, 1, 2]
     promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
@@ -206,9 +208,14 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     started = [weight.clone() for weight in whole.algorithm.policies["model_free"].parameters()]
     found = whole.train()
     interrupted_in(1, monkeypatch)
-    assert len(with_all_parts(tmp_path / "parts", 3).train()["episodes"]) == 1
+    interrupted = with_all_parts(tmp_path / "parts", 3)
+    assert len(interrupted.train()["episodes"]) == 1
     monkeypatch.undo()
     resumed = with_all_parts(tmp_path / "parts", 3, resume=True)
+    # It was judged and saved as its last whole episode left it.
+    its, ours = interrupted.algorithm, resumed.algorithm
+    assert len(its.learner.memory) == len(ours.learner.memory) == 20
+    assert clones(its.twin.closure, ours.twin.closure)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
     assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].turns.pause > 1
     assert resumed.algorithm.belief.flown
