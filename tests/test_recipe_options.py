@@ -6,6 +6,7 @@ import math
 import re
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,11 +17,22 @@ from test_export_recipe import RECIPES, recipe
 
 import rt_torchrl
 from rt_torchrl import Plant, rk4_step
+from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import File, Limit, Widths, choices, configuration, read_options
 from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import (
+    AssimilationConfig,
+    ExogenousConfig,
+    LearnerConfig,
+    PlannerConfig,
+    RefereeConfig,
+    TwinningConfig,
+)
+from rt_torchrl.systems.config import SafetyConfig
+from rt_torchrl.systems.exploration import ExplorationConfig
 
 HEADER = "! TurbSim\n"
 LINE = "{time:.2f} {speed:g} 0 0 0 0 0 0\n"
@@ -274,6 +286,39 @@ def test_the_choices_of_a_literal_are_known():
 def test_every_public_configuration_checks_its_options(name):
     with pytest.raises(ValueError, match=f"{name} has no option colour"):
         getattr(rt_torchrl, name)(colour="red")
+
+
+CONFIGS = {
+    DescentConfig: {"optimiser": "newton", "rate": math.inf, "gradient_limit": math.nan},
+    EstimationConfig: {"errors": "newton", "prior": math.inf, "rounds": math.nan, "iterations": math.nan},
+    ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
+    AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
+    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "stall": math.nan},
+    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "window": math.nan},
+    LearnerConfig: {
+        "critic_rate": math.inf,
+        "batch_size": math.nan,
+        "reward_scale": math.inf,
+        "memory_capacity": math.inf,
+    },
+    ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
+    SafetyConfig: {"interval": "0.5"},
+    partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan, "patience": True},
+    TwinningConfig: {"arm": "modelfree", "records": math.nan, "realisations": math.inf, "virtual_episodes": 2.5},
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "option", "value"),
+    [(config, option, value) for config, options in CONFIGS.items() for option, value in options.items()],
+)
+def test_every_configuration_checks_its_options(config, option, value, unchecked):
+    with pytest.raises(ValueError, match=re.escape(f"{option}={value!r} ")):
+        config(**{option: value})
+
+
+def test_a_gradient_may_be_without_a_limit():
+    assert DescentConfig(gradient_limit=math.inf).gradient_limit == math.inf
 
 
 # What a recipe's command line tells in one line instead of a traceback.
