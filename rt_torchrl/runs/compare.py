@@ -390,7 +390,7 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
 
     drawn = [(comparison, rows) for comparison in comparisons for rows in comparison.tasks()]
     names = list(dict.fromkeys(row.name for comparison in comparisons for row in comparison.rows))
-    columns = min(3, len(drawn))
+    columns = 2 if len(drawn) == 4 else min(3, len(drawn))
     size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(drawn) // columns))
     figure, axes = panels(-(-len(drawn) // columns), columns, title=title, size=size)
     for ax in axes.flat[len(drawn) :]:
