@@ -26,11 +26,11 @@ and what each step reports beside. What lasts between episodes belongs to the st
 import copy
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import BaseCollector
@@ -277,6 +277,12 @@ class ReinforcementTwinning(TensorDictSequential):
         except BaseException:
             self.model_based.load_state_dict(policy)
             raise
+
+    def select_subsequence(
+        self, in_keys: Iterable[NestedKey] | None = None, out_keys: Iterable[NestedKey] | None = None
+    ) -> TensorDictSequential:
+        """The steps that some keys need, as a sequence without the algorithm's bookkeeping."""
+        return TensorDictSequential(OrderedDict(self.module.items())).select_subsequence(in_keys, out_keys)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the next episode depends on beside policies, closure and the state of the steps."""
