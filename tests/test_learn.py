@@ -522,6 +522,16 @@ def test_eviction_goes_by_the_present_priorities():
     assert {2.0, 3.0, 4.0, 5.0, 8.0} <= set(drawn.tolist()) and drawn.mode().values == 8.0
 
 
+def test_a_single_transition_takes_the_place_of_the_least_one_too():
+    """TorchRL's ``add`` after ``store``: a free place first, then that of the least priority."""
+    found = memory(capacity=3)
+    found.store(labelled([0.0, 1.0]), torch.tensor([5.0, 1.0]))
+    assert found.buffer.add(labelled([2.0])[0]) == 2
+    found.refresh(torch.tensor([2]), torch.tensor([3.0]))
+    assert found.buffer.add(labelled([3.0])[0]) == 1
+    assert labels(found) == [0.0, 2.0, 3.0]
+
+
 def test_state_round_trip_samples_the_same():
     first, second = memory(seed=1), memory(seed=1)
     first.store(labelled(list(range(8))), ERRORS)

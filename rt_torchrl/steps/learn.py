@@ -729,7 +729,16 @@ class LeastPriorityWriter(RoundRobinWriter):
         self.priorities = np.zeros(capacity, dtype=np.float32)
         """Priority of the transition in each place; of equal ones the first goes first."""
 
+    def add(self, data: TensorDictBase) -> int:
+        """Write one transition in its place, which is returned."""
+        return int(self.extend(data.unsqueeze(0))[0])
+
     def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
+        """Write transitions in their places, which are returned.
+
+        Raises:
+            ValueError: if there are more transitions than places.
+        """
         stored, capacity, n = len(self._storage), len(self.priorities), len(data)
         if n > capacity:
             raise ValueError(
