@@ -295,6 +295,10 @@ class RealEpisodes(UnseenEpisodes):
         live.begin(policy, strength=0.0)
         return TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
+    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
+        """No categories, because the exogenous inputs need not be the same each time."""
+        return {}
+
 
 class Judged(NamedTuple):
     """J_a and the plant's own quantities of each unseen episode under one controller."""
