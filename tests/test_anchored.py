@@ -91,6 +91,13 @@ def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
     assert torch.equal(replays.flown[0], replays.actions(policy)) and replays.explored.tolist() == [0.0, 0.0]
 
 
+def test_the_vector_field_of_an_anchored_plant_is_that_of_the_plant():
+    plant, (t, state, action, inputs) = LinearQuadratic(), torch.rand(4, 3, 2, dtype=torch.float64)
+    t, action, z = t[:, 0], action[:, :1], inputs[:, :1]
+    found = Anchored(plant).vector_field(t, state, action, torch.cat([z, inputs], -1), plant.closure)
+    assert torch.equal(found, plant.vector_field(t, state, action, z, plant.closure))
+
+
 def pushed(horizon=5.0):
     """A linear plant on which more acts than its sensor reads, and the plant that its twin knows."""
     physics = LinearQuadratic(horizon=horizon)
