@@ -145,7 +145,9 @@ def test_the_handover_keeps_the_actuators_own_rate():
     torch.testing.assert_close(applied[20:], action[20:])
 
 
-@pytest.mark.parametrize("options", [{"learning": -0.1}, {"speed": 0.0}, {"speed": math.inf}, {"handover": 0}])
+@pytest.mark.parametrize(
+    "options", [{"learning": -0.1}, {"learning": math.nan}, {"speed": 0.0}, {"speed": math.inf}, {"handover": 0}]
+)
 def test_impossible_options_are_refused(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}="):
         OperationConfig(**options)

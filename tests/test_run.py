@@ -262,16 +262,23 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"episodes": 0}, "episodes=0"),
+        ({"episodes": 2.5}, "episodes=2.5 must be a whole number"),
         ({"unseen": 1}, "unseen=1"),
+        ({"threads": -1}, "threads=-1"),
         ({"resume": True}, "resume needs log_dir"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"seed": 2**63}, "seed=9223372036854775808 must be at most 9223372036854775806"),
+        ({"hidden": (8, 0)}, r"hidden\[1\]=0 must be at least 1"),
         ({"closure_hidden": (0,)}, r"closure_hidden\[0\]=0 must be at least 1"),
+        ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
+        ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
         ({"model_free_policy": "x"}, "model_free_policy='x' does not exist; choose same, plant or mlp"),
         (
             {"engine": "fast"},
             "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd",
         ),
+        ({"noise": -0.1}, "noise=-0.1 must be at least 0"),
         ({"noise": math.inf}, "noise=inf must be a finite number"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],

@@ -120,9 +120,10 @@ def test_records_that_are_no_numbers_or_do_not_fit_are_refused(unchecked):
     (state, exogenous, command), rollout = drawn(plant, 3), Rollout(plant, plant.closure)
     with pytest.raises(ValueError, match="exogenous has shape"):
         rollout.costs(state, exogenous[:2], command)
-    exogenous[0, 0, 0] = math.nan
-    with pytest.raises(ValueError, match="exogenous holds NaN"):
-        rollout.costs(state, exogenous, command)
+    for odd in (math.nan, math.inf, -math.inf):
+        exogenous[0, 0, 0] = odd
+        with pytest.raises(ValueError, match="exogenous holds NaN or infinite"):
+            rollout.costs(state, exogenous, command)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
