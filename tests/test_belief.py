@@ -325,6 +325,8 @@ def play(config, script, live="model_free"):
         ),
         # Equal costs are not worse; a change equal to T_w is no stall.
         ([(EQUAL, MOVING), (EQUAL, 0.5), (EQUAL, 0.4999)], [("keep", 0, 0), ("keep", 0, 0), ("keep", 0, 1)]),
+        # A little more is worse.
+        ([((0.99, 1.0), MOVING), ((1.01, 1.0), MOVING)], [("keep", 0, 0), ("keep", 1, 0)]),
         # An infinite cost is worse than any other.
         ([((math.inf, 1.0), MOVING), ((1.0, math.inf), MOVING)], [("keep", 1, 0), ("keep", 0, 0)]),
     ],

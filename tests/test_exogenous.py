@@ -47,6 +47,21 @@ def test_samples_have_the_mean_and_covariances_of_the_model():
     assert found.covariance[4, 1, 0] > 0.4 * size.prod() > 10.0 * math.sqrt(2.0 / count) * size.prod()
 
 
+@pytest.mark.parametrize("n", [8, 1201])
+def test_spectrum_of_the_embedding_is_not_negative(n):
+    """The FFT of the circulant is a spectral matrix at each frequency, not negative but for rounding."""
+    for found in (process(autoregressive(n, 0.9, seed=n)), process(bivariate(n, 0.9, 2, 0.8, seed=n), FREE * 2)):
+        C = found.covariance.numpy()
+        circulant = np.concatenate([C, 0.0 * C[:1], C[:0:-1].swapaxes(1, 2)])
+        assert len(circulant) == 2 * n
+        spectrum = np.fft.fft(circulant, axis=0)
+        eigenvalues = np.linalg.eigvalsh(spectrum)
+        assert np.abs(spectrum - spectrum.conj().swapaxes(1, 2)).max() < 1e-12 * eigenvalues.max()
+        assert eigenvalues.min() > -1e-12 * eigenvalues.max()
+        size = np.sqrt(C[0].diagonal())
+        assert (size > 0).all() and (np.abs(C) <= np.outer(size, size) * (1 + 1e-12)).all()
+
+
 def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     n, period = 1200, 300.0
     t = DT * np.arange(n)
