@@ -131,6 +131,14 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     torch.testing.assert_close(cost, -episode["next", "reward"][..., 0].mean(-1), rtol=1e-12, atol=0)
 
 
+def test_reward_is_minus_the_running_cost(plant):
+    episode, _ = fly(plant, batch=3)
+    t = plant.dt * torch.arange(plant.n_steps, dtype=torch.float64)
+    cost = plant.running_cost(t, episode["state"], episode["next", "applied"], episode["exogenous"])
+    torch.testing.assert_close(episode["next", "reward"][..., 0], -cost, rtol=1e-12, atol=1e-15)  # rounding
+    assert (cost >= 0).all()
+
+
 def test_environment_fulfils_its_specs(plant):
     check_env_specs(PlantEnv(plant, batch_size=2, seed=3), seed=3)
 
@@ -149,15 +157,19 @@ def test_environment_is_seeded(plant):
     assert torch.equal(flights[0], flights[1]) and not torch.equal(flights[0], flights[2])
 
 
+EXTENDED = ("stacked", "delay", "residual")
 CHECK = """
 import sys
 sys.path.insert(0, "tests")
-from test_plant_contract import CLASSES, shortened
+from linear_quadratic import LinearQuadratic
+from test_extensions import EXTENSIONS
+from test_plant_contract import CLASSES, EXTENDED, shortened
 from rt_torchrl import check_plant
 
-for name, kind in CLASSES.items():
+plants = {name: shortened(kind, 50) for name, kind in CLASSES.items()}
+for name, plant in (plants | {name: EXTENSIONS[name](LinearQuadratic()) for name in EXTENDED}).items():
     try:
-        check_plant(shortened(kind, 50))
+        check_plant(plant)
         print("fulfilled by", name)
     except ValueError as error:
         print(error, file=sys.stderr)
@@ -168,7 +180,7 @@ for name, kind in CLASSES.items():
 def test_plants_fulfil_the_contract_and_are_one_graph():
     """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
     found = fresh_process.run(CHECK)
-    for name in CLASSES:
+    for name in (*CLASSES, *EXTENDED):
         assert f"fulfilled by {name}\n" in found.stdout, found.stderr[-3000:]
 
 
