@@ -2,6 +2,7 @@
 
 import math
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -192,13 +193,23 @@ def patched(content, offset, form, value):
         (lambda c: patched(c, 2, "<i", -5), "header is corrupt, .*n_z=-5"),
         (lambda c: patched(c, 42, "<f", 0.0), "header is corrupt, .*u_slope=0.0"),
         (lambda c: patched(c, 34, "<f", 101.0), r"the hub lies outside the height of the grid, 4\.1 spacings"),
+        # n_z, n_y, n_tower, n_t and the length of the description, all as great as they can be declared.
+        *(
+            (lambda c, at=at: patched(c, at, "<i", 2**31 - 1), "is truncated, it holds 6679 bytes")
+            for at in (2, 6, 10, 14, 66)
+        ),
     ],
 )
-def test_faulty_bts_files_are_refused(tmp_path, spoil, message):
+def test_faulty_bts_files_are_refused_without_memory_for_what_they_declare(tmp_path, spoil, message):
     path = tmp_path / "field.bts"
     path.write_bytes(spoil(bts_bytes(plane()[1])[0]))
-    with pytest.raises(ValueError, match=rf"field\.bts: {message}"):
-        read_wind(path)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=rf"field\.bts: {message}"):
+            read_wind(path)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_wind_has_the_mean_and_covariance_of_the_process():
