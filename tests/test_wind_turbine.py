@@ -348,7 +348,23 @@ def test_the_gains_have_the_gradients_of_finite_differences():
         def make_policy(self, generator):
             return GainScheduled(self, generator=generator)
 
-    check_plant(Scheduled(horizon=60.0, observe=("scheduled",)), episodes=2, steps=20, traced=False)
+    plant = Scheduled(horizon=60.0, observe=("scheduled",))
+    check_plant(plant, episodes=2, steps=20, traced=False)
+    state, wind = plant.draw_initial_state(2, seeded(2)), plant.draw_exogenous(2, seeded(2)) + 2.0
+    policy = plant.make_policy(seeded(4))
+    rollout = Rollout(plant, plant.closure, policy)
+    (gradient,) = torch.autograd.grad(rollout.costs(state, wind).mean(), policy.weights)
+    assert gradient.abs().min() > 0.0
+    for k, exact in enumerate(gradient.tolist()):
+        costs = []
+        for change in (1e-5, -2e-5):
+            with torch.no_grad():
+                policy.weights[k] += change
+                costs.append(rollout.costs(state, wind).mean().item())
+        with torch.no_grad():
+            policy.weights[k] += 1e-5
+        # Central differences of a cost of order 0.1: rounding 1e-11, truncation below it but for kinks of the limits.
+        assert exact == pytest.approx((costs[0] - costs[1]) / 2e-5, rel=1e-4, abs=1e-8)
 
 
 # ROSCO's simulator of the same turbine: against our plant, as a real system, and under ROSCO's own controller.
