@@ -243,19 +243,25 @@ def modbus(read, written, inputs=()):
 
 
 @pytest.mark.parametrize(
-    ("registers", "message"),
+    ("registers", "refused", "message"),
     [
-        ({"written": {"torque": Register(1000)}}, "torque = 1.5.*registers 1000 to 1003.*illegal data address"),
-        ({"read": {"pressure": Register(40)}}, "pressure.*registers 40 to 43.*illegal data address"),
+        (
+            {"written": {"torque": Register(1000)}},
+            "write",
+            "torque = 1.5.*registers 1000 to 1003.*illegal data address",
+        ),
+        ({"read": {"pressure": Register(40)}}, "read", "pressure.*registers 40 to 43.*illegal data address"),
     ],
 )
-def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason(registers, message):
+def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason(registers, refused, message):
     given = {"read": {"position": Register(0)}, "written": {"torque": Register(0)}} | registers
     with modbus(**given) as (link, client):
+        requests = {"read": link.read, "write": lambda: link.write({"torque": 1.5})}
         with pytest.raises(RefusedRequestError, match=message):
-            link.write({"torque": 1.5})
-            link.read()
+            requests.pop(refused)()
         assert client.connected
+        for served in requests.values():
+            served()  # the connection is still there
 
 
 def test_registers_have_a_type_a_scale_and_a_word_order():
