@@ -1,7 +1,9 @@
 """The interface of Bladed: our library against the policy in torch, ROSCO's controller on our turbine, and faults."""
 
+import copy
 import ctypes
 import math
+import pickle
 import subprocess
 from pathlib import Path
 
@@ -231,6 +233,39 @@ def test_a_library_is_told_the_state_of_the_turbine(tmp_path):
     assert read[20] == pytest.approx([122.91] * 2, rel=1e-5) and read[21] == pytest.approx([1.26711] * 2, rel=1e-5)
     assert read[27] == [13.0] * 2 and read[23] == read[15] == [43_083.55] * 2  # clamped to the rated torque
     assert plant.generator_efficiency * 43_093.55 * 122.9096 == pytest.approx(5e6)
+
+
+class Stalling(WindTurbine):
+    """A turbine whose episode ends where the rotor is slower than 0.9 rad/s."""
+
+    end_cost = 1.0
+
+    def ended(self, state):
+        return state[..., 0] < 0.9
+
+
+@needs_compiler
+def test_an_episode_that_has_ended_stays_in_its_state(tmp_path):
+    """The full torque stops the rotor in one wind, and not in the other."""
+    plant = Stalling(horizon=30.0)
+    start, wind = drawn(plant, 2)
+    start[:, 0], wind[0], wind[1] = 1.2, 5.0, 20.0
+    flown = DISCON(plant, compiled(tmp_path, "{ s[46] = 43093.55f; s[44] = 0.0f; }", "full")).fly(start, wind)
+    ended = plant.ended(flown.states)
+    first = int(ended[0].int().argmax())
+    assert 0 < first < 50 and not ended[1].any()
+    assert (flown.states[0, first:] == flown.states[0, first]).all()
+    assert ((flown.states[1, 1:, 0] - flown.states[1, :-1, 0]) != 0.0).all()
+
+
+def test_a_copy_and_one_of_another_process_fly_the_same(scheduled):
+    """As the acting process of an asynchronous training does; a copy of a controller in flight begins anew."""
+    plant, _, file, flown = scheduled
+    controller, (start, wind) = DISCON(plant, file), (flown.states[:1, 0], flown.exogenous[:1, :20])
+    for _ in range(2):
+        for made in (copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
+            assert torch.equal(made.fly(start, wind).states, flown.states[:1, :21])
+        controller.act(0.0, start, wind[:, 0])
 
 
 @needs_compiler

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import REMEDY, ClassicalController
 from rt_torchrl.export.discon import Record, places_of
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, held
 from rt_torchrl.plants.shapes import Action, Input, Inputs, Memory, Starts, State
 from rt_torchrl.plants.signal import place_of
 from rt_torchrl.trajectories.rollout import require_finite
@@ -74,6 +74,14 @@ class DISCON(ClassicalController):
         self._flying: list[_Copy] = []
         self._intervals = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy has, in this process or another one; it loads the library itself, and begins episodes."""
+        return {**self.__dict__, "_original": None, "_flying": [], "_intervals": 0}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._original = loaded(self.library)
+
     def begin(self) -> None:
         """Begin episodes with libraries that remember nothing."""
         self._intervals = 0
@@ -126,7 +134,7 @@ class DISCON(ClassicalController):
             t, state, inputs = k * plant.dt, states[-1], exogenous[:, k]
             command = self.act(t, state[:, : len(plant.readings)], inputs)
             end, action = plant.step(state.new_full((len(state),), t), state, command, inputs, closure)
-            states.append(end)
+            states.append(held(plant, state, end))
             applied.append(action)
         self.begin()
         require_finite(plant, torch.stack(states[1:]), initial_state, [closure, self], remedy=REMEDY)
