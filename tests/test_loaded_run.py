@@ -25,8 +25,10 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.steps import interact
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.systems.sound_part import SoundPart, sound_part
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
 WITHOUT_NEURAL_CLOSURE = ("pendulum",)
@@ -281,11 +283,14 @@ class Worn(RunConfig):
 
 
 @pytest.mark.parametrize("start", ["random", "controller"])
-def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start):
-    """The flight of the controller wears the system, too, and episodes that were not made do not."""
+def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start, monkeypatch):
+    """The flight of the controller and a refused one wear the system, too; episodes that were not made do not."""
     parts = {"first": PD, "callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
     run = small_run(tmp_path, 5, config=Worn, parts=parts, untrained=0, start=start)
-    run.train()
+    refused = SoundPart([], [], "refused by the test", whole=False)
+    answers = [*(start == "controller") * [None], None, refused, None]
+    monkeypatch.setattr(interact, "sound_part", lambda *given: answers.pop(0) or sound_part(*given))
+    assert run.train()["episodes"][-1]["episodes_refused"] == 1 and not answers
     found = load_run(tmp_path, Worn, plant=LinearQuadratic(horizon=2.0)).true_closure()
     assert torch.equal(found.matrix, run.unseen.closure.matrix)
 

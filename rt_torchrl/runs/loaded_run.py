@@ -175,7 +175,9 @@ class LoadedRun:
         """The closure of ``plant`` at the end of the training: a system that wears is not what it was."""
         if self.config.wear(self.plant) is None:
             return self.plant.closure
-        return worn_closure(self.config, self.plant, len(self.metrics["episodes"]))
+        # Flights that were refused wear the system, too; in an asynchronous run an episode has several windows.
+        flights = sum(each.get("windows", 1) + each.get("episodes_refused", 0) for each in self.metrics["episodes"])
+        return worn_closure(self.config, self.plant, int(flights))
 
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
         """Every figure of a finished run by name, with an episode of its own; see :meth:`LoadedRun.figure`."""
