@@ -48,10 +48,10 @@ class Config:
             a DISCON too.
         role: role of the policy, model_based or model_free.
         formats: one or more of c (C99 file and header), onnx (with the extra export), pt2 (torch.export) and discon
-            (shared library with the interface of Bladed, and its C file discon.c); by default c, and pt2 of a policy.
+            (shared library with the interface of Bladed, and its C file); by default c, and pt2 of a policy.
         output: folder for the files; by default RUN/exported.
-        name: name of the files and of the C function, to which _controller or _twin is added; by default PLANT_ROLE,
-            and PLANT for the twin.
+        name: name of the files and of the C function, to which _controller, _discon or _twin is added; by default
+            PLANT_ROLE, and PLANT for the twin.
         recipe: recipe that made the run, as its file or as package.module:Config; by default the recipe that the run
             names or, for a run of version 0.1, the recipe beside this file with the name of the plant.
     """
@@ -71,7 +71,8 @@ class Config:
                 raise ValueError(f"{option}={given} must be some of {', '.join(known)}.")
         for what in self.what:
             if not set(FORMATS[what]) & set(formats):
-                raise ValueError(f"formats={formats} must hold {FORMATS[what][0]}, the format of the {what}.")
+                known = " or ".join(FORMATS[what])
+                raise ValueError(f"formats={formats} holds no format of the {what}; add {known}.")
         for kind in self.formats or ():
             if not any(kind in FORMATS[what] for what in self.what):
                 raise ValueError(
@@ -117,7 +118,7 @@ def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) 
         error = WRITERS[kind](run.policy(config.role), path, plant, **named)
         found = "" if error is None else f"within {error:.1e} of the actions' ranges"
     elif what == "controller":
-        path, writer = (output / "discon.c", export_discon) if kind == "discon" else (path, export_controller)
+        path, writer = (output / f"{role}_discon.c", export_discon) if kind == "discon" else (path, export_controller)
         flown = writer(run.policy(config.role), path, plant, name=name)
         found = (
             ""

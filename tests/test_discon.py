@@ -391,10 +391,15 @@ def test_the_recipe_writes_a_library(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
     leave_run(tmp_path, "wind_turbine", policy="scheduled", horizon=5.0)
     export = recipe("export")
-    export.main(export.Config(run=tmp_path, what=("controller",), formats=("discon",)))
-    assert {path.name for path in (tmp_path / "exported").iterdir()} == {"discon.c", "libdiscon.so"}
-    assert "discon.c: within" in capsys.readouterr().out
+    given = {"run": tmp_path, "what": ("controller",), "formats": ("discon",), "output": tmp_path / "files"}
+    for options in ({}, {"role": "model_free"}, {"name": "blade"}):
+        export.main(export.Config(**given, **options))
+    names = [f"{name}_discon" for name in ("wind_turbine_model_based", "wind_turbine_model_free", "blade")]
+    files = {path.name for path in (tmp_path / "files").iterdir()}
+    assert files == {file for name in names for file in (f"{name}.c", f"lib{name}.so")}
+    assert "blade_discon.c: within" in capsys.readouterr().out
     plant = WindTurbine(observe=("scheduled",), horizon=5.0)
-    assert DISCON(plant, tmp_path / "exported" / "libdiscon.so").fly(*drawn(plant, 1)).states.isfinite().all()
+    for name in names:
+        assert DISCON(plant, tmp_path / "files" / f"lib{name}.so").fly(*drawn(plant, 1)).states.isfinite().all()
     with pytest.raises(ValueError, match="no discon of policy can be written"):
         export.Config(run=tmp_path, formats=("c", "discon"))
