@@ -189,10 +189,9 @@ class Training:
             return False
         asked = self.asked()
         found = differences(self.folder, asked, HARMLESS - {"unseen_every"})
-        origins = (read_settings(self.folder).get("recipe") or {}, settings_of(asked, "")["recipe"])
-        its, mine = (origin.get("file") for origin in origins)
-        if its != mine:
-            found.append(f"the recipe is {mine} here and was {its} in the run")
+        recipe, mine = read_settings(self.folder).get("recipe"), settings_of(asked, "")["recipe"]["file"]
+        if recipe and recipe.get("file") != mine:  # a run of version 0.1 names none
+            found.append(f"the recipe is {mine} here and was {recipe.get('file')} in the run")
         metrics = read_json(self.folder / "metrics.json")
         done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes
         if done > wanted:

@@ -441,3 +441,8 @@ def test_a_folder_with_a_run_of_another_recipe_is_refused(tmp_path):
     elsewhere.write_text(TINY.read_text())
     with pytest.raises(ValueError, match=rf"the recipe is {elsewhere} here and was {TINY.resolve()} in the run"):
         study.studied(dataclasses.replace(made, systems=(f"tiny={elsewhere}",)))
+    # One of version 0.1 does not name its recipe, and is kept.
+    ((training,),) = dataclasses.replace(made, systems=(f"tiny={elsewhere}",)).trainings().values()
+    settings = json.loads((training.folder / "config.json").read_text())
+    (training.folder / "config.json").write_text(json.dumps({**settings, "recipe": None}))
+    assert training.finished()
