@@ -28,6 +28,7 @@ from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.results import SCREEN, closure_lines, fit_lines, next_steps, results_table
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
@@ -389,6 +390,16 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
     record |= {f"rms/{name}": value for name, value in rms.items()}
     assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
+
+
+@pytest.mark.parametrize(("episodes", "summary"), [({}, {}), ([1], {}), ([], None), (None, {})])
+def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
+    (tmp_path / "metrics.json").write_text(json.dumps({"episodes": episodes, "summary": summary}))
+    message = (
+        r"metrics\.json is damaged: it must be an object with episodes, a list of objects, and summary, an object\."
+    )
+    with pytest.raises(ValueError, match=message):
+        read_metrics(tmp_path)
 
 
 RULER = Path(__file__).parent / "ruler.py"

@@ -21,9 +21,13 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         metrics: Any = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged, or cannot be read: {error}") from error
-    if not (isinstance(metrics, dict) and {"episodes", "summary"} <= metrics.keys()):
-        raise ValueError(f"{file} is damaged: it must be an object with episodes and summary.")
-    return metrics
+    given = metrics if isinstance(metrics, dict) else {}
+    episodes, summary = given.get("episodes"), given.get("summary")
+    if not (isinstance(episodes, list) and all(isinstance(e, dict) for e in episodes) and isinstance(summary, dict)):
+        raise ValueError(
+            f"{file} is damaged: it must be an object with episodes, a list of objects, and summary, an object."
+        )
+    return given
 
 
 def on_the_twin(unseen: Mapping[str, Any]) -> bool:
