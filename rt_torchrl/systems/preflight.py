@@ -114,7 +114,8 @@ class Wiring(NamedTuple):
         plant: plant that gives the states.
         present: the wiring as it is; ``error`` is the RMS error of one-step predictions, in the units of the states.
         moved: RMS movement of each state in an interval, in its unit.
-        mistakes: mistakes that fit much better, the best one first; empty if the wiring is right or nothing fits.
+        mistakes: the readings that stand still where the twin moves, of which no other wiring is tried; or the mistakes
+            that fit much better, the best one first. Empty if the wiring is right or nothing fits.
     """
 
     plant: Plant
@@ -134,14 +135,16 @@ class Wiring(NamedTuple):
                 for signal, share in zip(self.plant.states, mistake.unexplained.tolist(), strict=True)
                 if math.isfinite(share)
             )
-            rows.append(f"  much less is unexplained if {mistake.mistake}{shares and ': '}{shares}")
+            rows.append(
+                f"  much less is unexplained if {mistake.mistake}: {shares}" if shares else f"  {mistake.mistake}"
+            )
         return "\n".join(rows)
 
     def require(self) -> None:
         """Refuse a system whose wiring does not fit.
 
         Raises:
-            WiringError: if a mistake fits much better.
+            WiringError: if a mistake fits much better, or a reading stands still where the twin moves.
         """
         if self.mistakes:
             raise WiringError(
@@ -199,7 +202,7 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
     names, unknown = (signal.name for signal in plant.states), torch.full_like(moved, torch.nan)
     mistakes = [
-        Suspicion(f"the reading of state {name} did not stand still", unknown, present.error)
+        Suspicion(f"the reading of state {name} stands still, and the twin moves", unknown, present.error)
         for name, stands in zip(names, stuck, strict=True)
         if stands
     ]
