@@ -60,8 +60,8 @@ class Extension(Plant):
     Here ā is the action that acts on the plant while the actuators believe that a does. The states are those of the
     plant followed by x. Everything else is asked of the plant, by :meth:`ask`: its task in its :meth:`true_state` and
     under the action that acts, and what a controller knows in what sensors read. An extension says how its dynamics
-    differ and nothing else. Parameters w are in the closure, beside
-    those of the plant's closure, so that a twin of the extended plant identifies both. Extensions nest.
+    differ and nothing else. Parameters w are in the closure, beside those of the plant's closure, so that a twin of the
+    extended plant identifies both. Extensions nest.
 
     Args:
         base: the plant.
