@@ -300,14 +300,50 @@ def test_of_weights_that_flew_their_own_flights_count_and_not_those_of_their_nei
     assert loud.expected(same, 2.0) == pytest.approx(2.0 * math.exp(loud.correction(same).item()))
 
 
-def test_an_episode_on_which_the_twin_diverges_is_left_out():
+@pytest.mark.parametrize("gain", [-1e3, -1e40])
+def test_an_episode_on_which_the_twin_nearly_diverges_or_does_is_left_out(gain):
     real, physics = pushed(horizon=2.0)
     belief = belief_of(real, physics, [(0.5, 0.5), (0.6, 0.5)])
     before = belief.correction(LinearGain([[0.55, 0.5]])).item()
-    wild = belief.flown[0]._replace(weights={"gain": torch.tensor([[-1e3, 0.0]]).double()})
+    wild = belief.flown[0]._replace(weights={"gain": torch.tensor([[gain, 0.0]]).double()})
     belief.append(wild.trajectory, "model_based", wild.cost, weights=wild.weights)
     assert abs(belief.differences()[-1]) == 5.0 and len(belief.anchors().replays.read) == 2
     assert belief.correction(LinearGain([[0.55, 0.5]])).item() == pytest.approx(before, rel=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(140.0, 140.0), (200.0, math.exp(5.0))])
+def test_a_twin_that_is_wrong_by_any_factor_is_not_believed(factor, expected):
+    """Beyond e⁵ the size does not count, and the episode still corrects what has not flown."""
+    physics = LinearQuadratic(horizon=2.0)
+    belief = belief_of(physics, physics, [(0.5, 0.5)])
+    dear = belief.flown[0]._replace(cost=factor * belief.flown[0].cost)
+    belief = belief_of(physics, physics, [])
+    belief.append(dear.trajectory, "model_based", dear.cost, weights=dear.weights)
+    noise = belief.anchors().noise
+    assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == pytest.approx(expected * math.exp(0.5 * noise))
+    assert belief.expected(LinearGain([[0.51, 0.5]]), 1.0) > 100.0
+
+
+def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
+    real, physics = pushed(horizon=2.0)
+    belief = belief_of(real, physics, [])
+    (record,), _, cost = flown_on(real, LinearGain([[0.5, 0.5]]), physics, count=1)
+    wild = LinearGain([[-1e40, 0.0]])
+    belief.append(record, "model_based", cost.item(), weights=wild.state_dict())
+    assert belief.contradicted and belief.anchors() is None and belief.differences() == [5.0]
+    assert belief.expected(wild, 1.0) == pytest.approx(math.exp(5.0 + 0.5 * NOISE**2))
+    assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == 1.0
+
+
+def test_the_best_that_flew_is_found_whatever_was_computed_before():
+    real, physics = pushed()
+    gains, episodes, like = [(2.0, 0.5), (0.5, 0.5), (1.0, 0.5)], virtual_episodes(physics), LinearGain([[0.0, 0.0]])
+    fresh, warm = belief_of(real, physics, gains), belief_of(real, physics, gains)
+    warm.anchors()
+    (weights, judged), (same, again) = fresh.best_flown(like, episodes), warm.best_flown(like, episodes)
+    assert judged == again and torch.equal(weights["gain"], same["gain"])
+    policy = LinearGain(weights["gain"].tolist())
+    assert warm.judge(policy, episodes).expected == pytest.approx(judged.expected, rel=1e-12)
 
 
 def test_prices_are_corrected_in_plans_as_where_policies_are_compared():

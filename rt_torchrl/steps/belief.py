@@ -20,6 +20,7 @@ episode refuted does not come back because policies like it were cheap. How well
 it is.
 """
 
+import contextlib
 import copy
 import math
 from collections.abc import Mapping, Sequence
@@ -108,7 +109,7 @@ class Belief:
         self.virtual, self.corrects = virtual, corrects
         self._policies = policies
         self.flown: list[Flown] = []
-        self._differences: tuple[Any, list[float]] | None = None
+        self._differences: tuple[Any, tuple[list[float], list[float]]] | None = None
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
@@ -155,16 +156,24 @@ class Belief:
 
         Episodes of state feedback count as none, with NaN: its flights on the twin take too long.
         """
+        return self._predicted_again()[1]
+
+    def _predicted_again(self) -> tuple[list[float], list[float]]:
+        """J_a that the present twin says of each episode, infinite where it diverges, and the paired differences."""
         state = self.virtual.twin.state_dict()
         if self._differences is None or not equal(state, self._differences[0]):
-            differences = list[float]()
+            costs = list[float]()
             for flown in self.flown:
-                d = math.nan
-                if not isinstance(self._policies[flown.role], StateFeedback):
-                    predicted = self.virtual.cost(self.policy_of(flown), self.virtual.repeated(flown.trajectory))
-                    d = difference(flown.cost, predicted)
-                differences.append(d)
-            self._differences = copy.deepcopy(state), differences
+                unknown = isinstance(self._policies[flown.role], StateFeedback)
+                again = (
+                    math.nan
+                    if unknown
+                    else self.virtual.cost(self.policy_of(flown), self.virtual.repeated(flown.trajectory))
+                )
+                costs.append(again)
+            pairs = zip(self.flown, costs, strict=True)
+            found = [math.nan if math.isnan(again) else difference(flown.cost, again) for flown, again in pairs]
+            self._differences = copy.deepcopy(state), (costs, found)
         return self._differences[1]
 
     def examine(self) -> TensorDict:
@@ -214,18 +223,20 @@ class Belief:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
         if not self.corrects or not 0.0 < cost < math.inf:
             return cost
-        anchors, weights = self.anchors(), dict(policy.state_dict())
+        weights = {name: weight.clone() for name, weight in policy.state_dict().items()}
         pairs = zip(self.differences(), self.flown, strict=True)
         flown = [d for d, one in pairs if one.exploration <= QUIET and equal(one.weights, weights)]
-        if anchors is not None and flown and not any(map(math.isnan, flown)):
-            return cost * math.exp((sum(flown) + 0.5 * anchors.noise) / len(flown))
         try:
-            return cost * math.exp(self.correction(policy).item())
+            if self.contradicted and flown and not any(map(math.isnan, flown)):
+                anchors = self.anchors()
+                noise = NOISE**2 if anchors is None else anchors.noise
+                return cost * math.exp((sum(flown) + 0.5 * noise) / len(flown))
+            return cost * math.exp(min(DEARER, self.correction(policy).item()))
         except DivergenceError:
             return math.inf
 
     def correction(self, policy: nn.Module, *, latest: int = HISTORY) -> Float[Tensor, ""]:
-        """The log m + s²/2 of the expected cost over the twin's, at most 5, differentiable by the policy's weights.
+        """The log m + s²/2 of the expected cost over the twin's, differentiable by the policy's weights.
 
         It is zero while the twin is right, and for state feedback, which is no function of an observation.
 
@@ -243,10 +254,16 @@ class Belief:
         apart = (replays.actions(policy) - replays.flown).square().sum(-1) + replays.explored
         alike = torch.exp(-0.5 * replays.distances() / LENGTH**2).sum(-1)
         precisions = 1.0 / (anchors.noise + anchors.growth * alike * apart)
-        return (((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()).clamp(max=DEARER)
+        return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether a real episode cost other than the present twin says, beyond what exploration explains."""
+        pairs = zip(self.differences(), self.flown, strict=True)
+        return any(beyond(d, flown.exploration) > NOISE for d, flown in pairs if not math.isnan(d))
 
     def anchors(self) -> "Anchors | None":
-        """The latest whole episodes on the present twin; None without any, and while the twin is right."""
+        """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
         twin = self.virtual.twin
         state = twin.state_dict()
         if self._anchored is None or not equal(state, self._anchored[0]):
@@ -255,16 +272,14 @@ class Belief:
 
     @torch.no_grad()
     def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
-        known = [
-            (flown, d) for flown, d in zip(self.flown, self.differences(), strict=True) if not math.isnan(d)
-        ]  # state feedback is no function of an observation
-        if not any(beyond(d, flown.exploration) > NOISE for flown, d in known):
+        if not self.contradicted:
             return None
         whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
-        for flown, d in known:
+        for flown, again, d in zip(self.flown, *self._predicted_again(), strict=True):
             met = self.virtual.repeated(flown.trajectory).exogenous
-            # A part of an episode has another cost, and where the twin blows up nothing is near.
-            if met.shape[1] == twin.plant.n_steps and abs(d) < DEARER:
+            # State feedback is no function of an observation, a part of an episode has another cost, and where the
+            # twin diverges, or nearly does, nothing is near.
+            if met.shape[1] == twin.plant.n_steps and math.isfinite(again) and d > -DEARER:
                 whole.append(flown)
                 inputs.append(met)
                 differences.append(d)
@@ -322,6 +337,8 @@ class Belief:
         """The weights that are expected to cost least of the last that have flown in an architecture; None without."""
         best: tuple[dict[str, Tensor], Judged] | None = None
         seen = list[dict[str, Tensor]]()
+        with contextlib.suppress(DivergenceError):  # which the judgements below meet again
+            self.anchors()  # now, because it takes the copies of the policies that are judged below
         for flown in self.flown[-ANCHORS:]:
             policy = self.policy_of(flown)
             if any(equal(flown.weights, weights) for weights in seen) or not same_architecture(policy, like):
@@ -329,7 +346,7 @@ class Belief:
             seen.append(flown.weights)
             judged = self.judge(policy, episodes)
             if best is None or judged < best[1]:
-                best = copy.deepcopy(policy.state_dict()), judged
+                best = copy.deepcopy(flown.weights), judged
         return best
 
     def require_sound_twin(self, episodes: Scenario) -> None:

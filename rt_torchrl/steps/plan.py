@@ -286,7 +286,7 @@ class MultiStart:
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
         whole = isinstance(self.planner, WholeEpisodes)
-        corrected = whole and self.belief.corrects and self.belief.anchors() is not None
+        corrected = whole and self.belief.corrects and self.belief.contradicted
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
         recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < stays else []
         if several or recalled:
