@@ -251,3 +251,41 @@ def test_compiled_equals_eager():
     """The test runs in a process of its own, because the run-time checks of this one cannot be compiled."""
     done = fresh_process.run(COMPARISON)
     assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]
+
+
+class Following(LinearQuadratic):
+    """Its state is what was commanded, and not what it was before."""
+
+    own_scheme = True
+
+    def advance(self, t, state, action, exogenous, closure):
+        return torch.cat([action, 2.0 * action], -1)
+
+
+class Free(LinearQuadratic):
+    """It moves by itself: nothing that acts on it, and no weight, enters its step."""
+
+    own_scheme = True
+
+    def advance(self, t, state, action, exogenous, closure):
+        return state * torch.tensor([0.9, 0.8], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plant", [Following, Free])
+@pytest.mark.parametrize("engine", ["native", "parallel"])
+def test_what_an_interval_does_not_depend_on_has_a_gradient_of_zero(plant, engine):
+    """The cost of both plants also depends on the action itself."""
+    system, generator = plant(horizon=1.0), seeded(0)
+    closure = system.closure.requires_grad_(False)
+    gradients = []
+    for chosen in (engine, "autograd"):
+        start = system.draw_initial_state(2, seeded(1)).requires_grad_()
+        command = torch.rand(2, system.n_steps, 1, generator=seeded(2)).double().requires_grad_()
+        exogenous = system.draw_exogenous(2, generator.manual_seed(3))
+        states = Rollout(system, closure, engine=chosen)(start, exogenous, command).states
+        gradients.append(
+            torch.autograd.grad(states.square().sum(), (start, command), materialize_grads=True, allow_unused=True)
+        )
+    for found, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+    assert gradients[0][0].abs().sum() > 0.0

@@ -105,10 +105,10 @@ def _products(
     found = []
     for states, *driven, costate in _pieces(PIECE, starts, drive, costates.flatten(0, 1)):
         driving = [marked_dynamic(plain(x), 0).requires_grad_() for x in driven]
+        leaves = *driving, *weights
         with torch.enable_grad():
             end = function(interval, marked_dynamic(plain(states), 0), Drive(*driving))
-        leaves = *driving, *weights
-        found.append(torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True))
+        found.append(_gradients(end, leaves, costate))
     t, exogenous, command, *of_weights = zip(*found, strict=True)
     # t may be the same for all realisations
     of_drive = [
@@ -116,6 +116,13 @@ def _products(
         for parts, x in zip((t, exogenous, command), drive, strict=True)
     ]
     return of_drive + [sum(parts, torch.zeros_like(parts[0])) for parts in of_weights]
+
+
+def _gradients(end: Tensor, leaves: tuple[Tensor, ...], costate: Tensor) -> tuple[Tensor, ...]:
+    """λᵀ∂Φ/∂x for each leaf x, zero for those on which an end state does not depend."""
+    if not end.requires_grad:
+        return tuple(torch.zeros_like(leaf) for leaf in leaves)
+    return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
 
 
 def _all_intervals(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
@@ -198,7 +205,7 @@ def _jacobians(
         state, *driving = (marked_dynamic(x.repeat_interleave(n_s, 0), 0) for x in piece)
         with torch.enable_grad():
             end = function(interval, state.requires_grad_(), Drive(*driving))
-        found += torch.autograd.grad(end, state, basis.repeat(len(state) // n_s, 1))
+        found += _gradients(end, (state,), basis.repeat(len(state) // n_s, 1))
     return torch.cat(found).unflatten(0, (*starts.shape[:2], n_s))
 
 
