@@ -1,6 +1,5 @@
 """Why a policy is poor: each reason in a run of which it is true, and in one of which it is not."""
 
-import dataclasses
 import json
 from dataclasses import field
 from typing import Literal
@@ -57,6 +56,7 @@ class Config(RunConfig):
     twinning: TwinningConfig = field(
         default_factory=lambda: TwinningConfig(
             arm="model_based",
+            virtual_episodes=50,
             exploration=ExplorationConfig(spread=0.0),
             planner=PlannerConfig(starts=0, receding_horizon=PredictiveConfig(horizon=3.0)),
         )
@@ -96,7 +96,8 @@ def rewrite(run, change):
 
 def test_a_run_that_ended_well_has_no_reason_but_that_it_acts_more(run):
     reasons = diagnose(run)
-    assert [reason.holds for reason in reasons] == [False, False, False, False, True]
+    # Ten episodes from random initial states scatter too much to compare them with those of the plan.
+    assert [reason.holds for reason in reasons] == [False, False, False, None, True]
     assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
     assert "mean force [N]" in reasons[COST].evidence and "against 0 of still" in reasons[COST].evidence
 
@@ -117,16 +118,37 @@ def test_a_class_that_sees_too_little_is_too_small(tmp_path):
 
 
 def test_an_alarm_is_a_twin_that_is_wrong(run):
-    rewrite(run, lambda metrics: [entry.update(paired_difference=0.7) for entry in metrics["episodes"]])
-    assert diagnose(run)[TWIN].holds and "cost 2.01, 2.01 times" in diagnose(run)[TWIN].evidence
-    twinning = dataclasses.replace(run.config.twinning, exploration=ExplorationConfig(spread=0.1))
-    explored = dataclasses.replace(run, config=dataclasses.replace(run.config, twinning=twinning))
-    assert diagnose(explored)[TWIN].holds is None
+    rewrite(run, lambda metrics: metrics["episodes"][-1].update(alarm=1.0, warning="the last 2 episodes cost too much"))
+    reason = diagnose(run)[TWIN]
+    assert reason.holds and reason.evidence == "the last 2 episodes cost too much"
+    rewrite(run, lambda metrics: metrics["episodes"][-1].update(alarm=0.0, warning=None, paired_difference=0.7))
+    reason = diagnose(run)[TWIN]
+    assert reason.holds is False and "cost 2.01 times what the twin says" in reason.evidence
 
 
-def test_unseen_episodes_that_cost_more_than_planned_have_other_inputs(run):
-    rewrite(run, lambda metrics: metrics["episodes"][-1].update(J_a_plan=1e-3))
-    assert diagnose(run, episodes=12)[INPUTS].holds
+@pytest.mark.parametrize(("count", "holds"), [(3, None), (12, True)])
+def test_unseen_episodes_that_cost_more_than_planned_have_other_inputs(run, count, holds):
+    """Three episodes from random initial states scatter too much to say so."""
+    rewrite(run, lambda metrics: [entry.update(J_a_plan=1e-3, paired_difference=0.0) for entry in metrics["episodes"]])
+    assert diagnose(run, episodes=count)[INPUTS].holds is holds
+
+
+def test_a_plan_on_corrected_costs_says_nothing_of_unseen_inputs(run):
+    rewrite(run, lambda metrics: metrics["episodes"][-1].update(J_a_plan=1e-3, paired_difference=0.3))
+    reason = diagnose(run)[INPUTS]
+    assert reason.holds is None and "is not the cost of the live policy on the twin" in reason.evidence
+
+
+def test_numbers_that_are_not_finite_are_null_in_a_run(run):
+    def forget(metrics):
+        unseen = metrics["summary"]["unseen"]
+        unseen["baselines"]["still"]["J_a"]["mean"] = None
+        metrics["episodes"][-1]["J_a_plan"] = None
+
+    rewrite(run, forget)
+    assert diagnose(run)[COST].holds is False
+    rewrite(run, lambda metrics: metrics["summary"]["unseen"]["J_a_model_based"].update(mean=None))
+    assert diagnose(run)[COST].holds is False
 
 
 def test_what_a_run_does_not_say_is_no_reason(run):
@@ -134,7 +156,7 @@ def test_what_a_run_does_not_say_is_no_reason(run):
         metrics["summary"]["unseen"]["baselines"] = {}
         for entry in metrics["episodes"]:
             entry.pop("J_a_plan")
-            entry.pop("paired_difference")
+            entry.pop("alarm")
 
     rewrite(run, forget)
     reasons = diagnose(run)
