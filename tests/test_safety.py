@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import gymnasium
 import pytest
@@ -176,6 +177,15 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
     assert [report.counts for report in env.reports] == [{"asked": 1, "fallback": 10, "range": 10, "not finite": 1}] * 2
     assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in range(2) for k in range(20)]
     assert found[0]["asked"] == [None] and found[0]["applied"] == [-1.0] and "asked" in found[0]["reasons"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this machine has no /dev/full")
+def test_a_log_on_a_full_disk_does_not_stop_a_machine_that_moves():
+    env = layer(rates=(0.1,), rest=(0.0,), log=Path("/dev/full"))
+    assert fly(env, [1.0] * 20).shape[1] == 20 and env.report.counts["rate"] == 20
+    with pytest.raises(OSError, match="No space left"):
+        env.reset()
+    env.reset()  # once is enough
 
 
 def test_reinforcement_twinning_learns_from_what_was_applied():
