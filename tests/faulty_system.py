@@ -38,12 +38,16 @@ class Injection:
 
 
 class FaultySystem(AroundSystem):
-    """An environment with injected faults and a clock, its entry ``time`` [s]."""
+    """An environment with injected faults and a clock, its entry ``time`` [s].
+
+    Attribute ``injected`` holds the episode, the interval and the kind of every fault so far.
+    """
 
     def __init__(self, env, injections, *, interval, sleep=time.sleep):
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.injections, self._interval, self._sleep = env, tuple(injections), interval, sleep
         self._episode, self._count, self._since, self._offset = -1, 0, 0, 0.0
+        self.injected = []
         self.action_spec, self.reward_spec = env.action_spec.clone(), env.reward_spec.clone()
         self.done_spec, self.observation_spec = env.full_done_spec.clone(), env.full_observation_spec.clone()
         self.observation_spec["time"] = Unbounded(shape=(*env.batch_size, 1), dtype=torch.float64)
@@ -64,6 +68,7 @@ class FaultySystem(AroundSystem):
         self._episode += self._count == 0
         active = {fault.kind: fault for fault in self.injections if fault.acts(self._episode, self._count)}
         begun = {kind for kind, fault in active.items() if fault.first == self._count}
+        self.injected += [(self._episode, self._count, kind) for kind in active]
         self._count, self._since = self._count + 1, self._since + 1
         if "raises" in active:
             raise ConnectionError("no answer (injected)")

@@ -179,7 +179,7 @@ PLANTS = {
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["synchronous", "asynchronous"])
 def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost, asynchronous):
     plant, generator = PLANTS[name](), torch.Generator().manual_seed(0)
-    system = guarded(injection, plant=plant)
+    layer = system = guarded(injection, plant=plant)
     policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = DigitalTwin(plant, plant.make_closure(generator))
     if asynchronous:  # learning takes no time, so that the second window is the second episode
@@ -188,6 +188,8 @@ def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost, asy
     found = ReinforcementTwinning(system, twin, **policies, config=SMALL, generator=generator)
     reports = [found.episode() for _ in range(3)]
     kinds = [{key for key in report.keys() if key.startswith("faults/")} for report in reports]  # noqa: SIM118
+    last = injection.first if injection.last is None else injection.last
+    assert layer.injected == [(1, k, injection.kind) for k in range(injection.first, last + 1)]
     assert not kinds[0] and (f"faults/{kind}" in kinds[1] or kind == "actuator")  # which nobody watches here
     stored = found.learner.memory.buffer[:]
     assert len(stored) == 3 * N - len(lost)
