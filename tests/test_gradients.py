@@ -7,7 +7,7 @@ from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
 from torch import nn
 
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
@@ -25,6 +25,8 @@ PLANTS = {
     # Half a beat, 50 steps.
     "flapping_wing": lambda: FlappingWing(horizon=0.025),
     "cryogenic_tank": lambda: CryogenicTank(horizon=900.0),
+    # Its terminal cost enters by the first state and the last.
+    "tank with an end": lambda: CryogenicTank(horizon=900.0, cost=PressureCost(end=43_200.0)),
     "pendulum": lambda: Pendulum(horizon=2.0),
 }
 # Number of outputs of a perceptron that stands in for a plant's closure, and their offset. The tank's coefficients, of
