@@ -251,6 +251,8 @@ def test_a_cost_without_finite_ranges_is_refused():
     plant.actions = (Signal(symbol="a", name="force", unit="N"),)
     with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
         CommandCost(plant, plant.closure)
+    with pytest.raises(ValueError, match="hold=0"):
+        CommandCost(LinearQuadratic(), plant.closure, hold=0)
 
 
 def test_the_descent_solves_a_bounded_least_squares_problem():
