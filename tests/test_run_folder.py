@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from torch import nn
 
 from rt_torchrl.atomic_file import write_atomically, write_json, write_results
 from rt_torchrl.options import read_options
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
@@ -507,6 +509,25 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
     refused(found | {"format": 2}, "checkpoint.pt has checkpoint format 2; this version reads format 5")
+
+
+class Observant(LinearQuadratic):
+    """The plant with one more observation, which none of its options names."""
+
+    observations = (*LinearQuadratic.observations, Signal(symbol="e", name="again", unit="m"))
+
+    def observe(self, t, state, exogenous):
+        return torch.cat([state, state[..., :1]], -1)
+
+
+def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
+    """The plant's arguments are not options of the run, so only the weights show them."""
+    options = QUICK | {"policy": "mlp", "hidden": (4,)}
+    small_run(tmp_path, episodes=1, **options).train()
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="weights do not fit"):
+        small_run(tmp_path, episodes=2, plant=Observant(horizon=2.0), resume=True, **options)
+    assert contents(tmp_path) == before
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
