@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import test_extensions as extensions
 import torch
@@ -10,7 +11,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from seeds_and_numbers import seeded
 from served_plants import served
-from small_runs import SMALL
+from small_runs import SMALL, small_run
 from test_classical import PD
 from test_export_controller import InC
 from test_extensions import flight
@@ -31,6 +32,7 @@ from rt_torchrl import (
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.evaluation.limits import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
@@ -84,6 +86,17 @@ def test_a_run_judges_on_the_true_system_and_keeps_its_hidden_states_hidden(tmp_
     assert loaded.physics.states == loaded.plant.readings == BASE.states
     torch.testing.assert_close(loaded.closure.matrix, run.algorithm.twin.closure.matrix)
     export_c(loaded.policy("model_free"), tmp_path / "policy.c", loaded.physics, function="policy")
+
+
+def test_the_optimum_is_that_of_the_true_system():
+    unseen = UnseenEpisodes(real(), 4)
+    start = LinearGain([[0.1, 0.1]])
+    found = exact_optimum(unseen, lambda _: LinearGain([[0.1, 0.1]]), starts=1, iterations=20, polish=10)
+    nominal = UnseenEpisodes(BASE, 4)
+    other = exact_optimum(nominal, lambda _: LinearGain([[0.1, 0.1]]), starts=1, iterations=20, polish=10)
+    cost = control_cost(real(), Rollout(real(), real().closure, found.policy)(unseen.initial_state, unseen.exogenous))
+    assert found.cost == pytest.approx(cost.mean().item(), rel=1e-9)
+    assert found.cost < 0.9 * min(unseen.control_costs(policy).mean() for policy in (other.policy, start))
 
 
 def test_a_twin_is_judged_by_what_sensors_read():
@@ -254,6 +267,33 @@ class Mass(LinearQuadratic):
         return state[..., :1]
 
 
+def test_two_positions_hold_a_mass_that_no_law_of_one_position_holds():
+    r"""A difference of positions is a speed: a_k = −p x_k − d (x_k − x_{k−1})/Δt.
+
+    With c = Δt²/2 and the gains g of the positions, the loop's poles are the zeros of
+    :math:`z^3 - 2z^2 + z + c(z + 1)(g_1z + g_2)`. With g_2 = 0 the product of the two others is 1 + c g_1, which must
+    be below 1, while 2 c g_1, the value at z = 1, must be positive.
+    """
+    p, d, n = 1.0, 1.5, 300
+    gains = np.array([p + d / DT, -d / DT])
+    loop = np.polyadd([1.0, -2.0, 1.0, 0.0], 0.5 * DT**2 * np.polymul([1.0, 1.0], gains))
+    assert np.abs(np.roots(loop)).max() < 0.95
+    for gain in np.linspace(-5.0, 20.0, 101):
+        alone = np.polyadd([1.0, -2.0, 1.0], 0.5 * DT**2 * gain * np.array([1.0, 1.0]))
+        assert np.abs(np.roots(alone)).max() >= 1.0 - 1e-7
+    plant = StackedObservations(Mass(dt=DT, horizon=n * DT, noise=0.0), 1)
+    start, exogenous = plant.draw_initial_state(4, seeded()), torch.zeros(4, n, 1, dtype=torch.float64)
+    flown = Rollout(plant, plant.closure, LinearGain(gains[None]))(start, exogenous)
+    x, v = start[:, :2].unbind(-1)
+    before, expected = x, [x]
+    for _ in range(n):
+        a = -gains[0] * x - gains[1] * before
+        before, x, v = x, x + DT * v + 0.5 * DT**2 * a, v + DT * a
+        expected.append(x)
+    torch.testing.assert_close(flown.states[..., 0], torch.stack(expected, -1), rtol=1e-10, atol=1e-12)
+    assert flown.states[:, -1, 0].abs().max() < 1e-5
+
+
 @needs_compiler
 def test_the_controller_in_c_holds_the_past_observations(tmp_path):
     plant = StackedObservations(Mass(dt=DT, horizon=5.0), 2)
@@ -345,6 +385,19 @@ def test_what_the_environment_does_not_report_is_refused_by_its_name():
     base = Timed(horizon=2.0)
     with pytest.raises(ValueError, match="the plant needs .*position_error_1_ago"):
         connected(StackedObservations(base, 1), rig=Rig(base))
+
+
+@pytest.mark.slow
+def test_a_run_on_such_a_real_system_resumes_to_the_bit(tmp_path):
+    base = Timed(horizon=2.0)
+
+    def train(folder, episodes, **options):
+        parts = {"env": connected(StackedObservations(base, 2), rig=Rig(base), computes=True, closure=base.closure)}
+        run = small_run(tmp_path / folder, episodes, StackedObservations(base, 2), parts=parts, **options)
+        return [{**record, "seconds": None} for record in run.train()["episodes"]]
+
+    whole, first = train("whole", 3), train("parts", 1)
+    assert train("parts", 3, resume=True) == whole and whole[:1] == first
 
 
 def test_the_page_runs(tmp_path, monkeypatch):
