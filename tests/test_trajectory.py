@@ -69,6 +69,20 @@ def test_converges_to_the_matrix_exponential(engine):
     assert errors[2] < 3e-5
 
 
+def test_engines_fly_one_realisation_alike():
+    plant = LinearQuadratic(horizon=2.0)
+    state, exogenous, _ = drawn(plant, 1)
+    policy = plant.make_policy(torch.Generator().manual_seed(1))
+    first, *others = (
+        Rollout(plant, plant.closure, policy, engine=engine)(state, exogenous) for engine in (*ENGINES, "native")
+    )
+    assert first.states.shape == (1, 21, 2) and first.actions.shape == (1, 20, 1)
+    for other in others:
+        # One tableau, written by torchdiffeq in another order of operations.
+        torch.testing.assert_close(other.states, first.states, rtol=1e-13, atol=1e-14)
+        torch.testing.assert_close(other.actions, first.actions, rtol=1e-13, atol=1e-14)
+
+
 class Clock(LinearQuadratic):
     """A plant that shows the policy the time, and whose cost depends on it."""
 
