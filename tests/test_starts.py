@@ -122,6 +122,11 @@ def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path
     assert all(isinstance(policy, SaturatedMLP) for policy in found.policies.values())
 
 
+def test_both_architectures_imitate(tmp_path):
+    report = training(tmp_path, start="controller", model_free_policy="mlp", hidden=(8,)).algorithm.start()
+    assert 0.0 < report["start_error_model_free"] < 0.05 and report["start_error_model_based"] < 1e-3
+
+
 def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
     arm = dataclasses.replace(TWINNING, arm="model_free")
     training(tmp_path / "half", start="controller", twinning=arm).train()
