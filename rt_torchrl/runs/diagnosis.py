@@ -20,7 +20,7 @@ MINIMUM, CLASS, INPUTS, MERIT = 0.03, 0.1, 0.2, 0.2
 class Reason(NamedTuple):
     """A reason why a policy may be poor.
 
-    Attributes:
+    Args:
         name: the reason.
         holds: whether it holds; None where the run does not say.
         evidence: the numbers that say so, in words.
