@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from torch.utils.backend_registration import _DummyBackendModule, _setup_private
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.command_line import load_recipe
+from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_folder import load_tensors, save_tensors
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
 
@@ -176,6 +178,52 @@ def pretend_device() -> Iterator[torch.device]:
             torch.Generator = REAL
 
 
+# A mode that fails where a tensor is made without a device.
+
+
+ROOT = Path(__file__).resolve().parent.parent
+WATCHED = tuple(str(ROOT / folder) + "/" for folder in ("rt_torchrl", "envs"))
+ON_THE_CPU = tuple(str(ROOT / "rt_torchrl" / part) for part in ("programs/", "systems/preflight.py"))
+"""What works on the CPU wherever the run is: machine code, and the check of the wiring, to which records are copied."""
+FACTORIES = {
+    torch.arange,
+    torch.empty,
+    torch.eye,
+    torch.full,
+    torch.from_numpy,
+    torch.linspace,
+    torch.logspace,
+    torch.ones,
+    torch.rand,
+    torch.randint,
+    torch.randn,
+    torch.randperm,
+    torch.scalar_tensor,
+    torch.tensor,
+    torch.zeros,
+}
+"""All that make a tensor from nothing; ``as_tensor`` leaves a tensor where it is, and is asked about numbers alone."""
+
+
+class RequireDevice(TorchFunctionMode):
+    """A mode that collects the places where code of this library makes a tensor without naming its device."""
+
+    def __init__(self):
+        super().__init__()
+        self.found: dict[str, str] = {}
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        numbers = func is torch.as_tensor and not isinstance(args[0], torch.Tensor)
+        if (func in FACTORIES or numbers) and kwargs.get("device") is None:
+            frame = sys._getframe(1)
+            file = frame.f_code.co_filename
+            if file.startswith(WATCHED) and not file.startswith(ON_THE_CPU):
+                place = f"{Path(file).relative_to(ROOT)}:{frame.f_lineno}"
+                self.found[place] = func.__name__
+        return func(*args, **kwargs)
+
+
 # Whole trainings on a device that is not the CPU: every tensor lies where the run's generator does.
 
 
@@ -196,8 +244,13 @@ TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, a
 
 
 @pytest.fixture
-def train(tmp_path):
-    """Trains by a recipe on the pretended device."""
+def train(tmp_path, monkeypatch):
+    """Trains by a recipe on the pretended device; gives the places where a tensor was made without one."""
+    watch, whole = RequireDevice(), Run._train
+
+    def watched(run):
+        with watch:
+            return whole(run)
 
     def run(recipe, *, twinning=None, **options):
         module = load_recipe(RECIPES / f"{recipe}.py")
@@ -205,13 +258,15 @@ def train(tmp_path):
         small |= {"device": NAME, "log_dir": tmp_path, "twinning": dataclasses.replace(ONE_OF_EACH, **(twinning or {}))}
         with pretend_device():
             module.main(module.Config(**small | options))
+        return watch.found
 
+    monkeypatch.setattr(Run, "_train", watched)
     return run
 
 
 @pytest.mark.slow
 def test_real_system_short_horizon_and_td3(train):
-    train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
+    assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
 
 
 @pytest.mark.slow

@@ -182,7 +182,7 @@ class Assimilation:
 
     def _descend(self, replayed: Trajectory) -> Descended:
         config = self.config
-        prior = self.prior.cost if self.prior.stiffness else lambda: torch.zeros((), dtype=torch.float64)
+        prior = self.prior.cost if self.prior.stiffness else lambda: replayed.states.new_zeros(())
         before = prior().item()
         if config.method == "levenberg_marquardt":
             found = self._least_squares(replayed)
