@@ -109,7 +109,7 @@ class Belief:
         self.virtual, self.corrects = virtual, corrects
         self._policies = policies
         self.flown: list[Flown] = []
-        self._differences: tuple[Any, tuple[list[float], list[float]]] | None = None
+        self._costs: tuple[Any, list[float]] | None = None
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
@@ -137,7 +137,7 @@ class Belief:
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
-        self._differences = self._anchored = None
+        self._costs = self._anchored = None
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it, until the next call for this role.
@@ -156,25 +156,21 @@ class Belief:
 
         Episodes of state feedback count as none, with NaN: its flights on the twin take too long.
         """
-        return self._predicted_again()[1]
+        pairs = zip(self.flown, self._predicted(), strict=True)
+        return [math.nan if math.isnan(predicted) else difference(one.cost, predicted) for one, predicted in pairs]
 
-    def _predicted_again(self) -> tuple[list[float], list[float]]:
-        """J_a that the present twin says of each episode, infinite where it diverges, and the paired differences."""
-        state = self.virtual.twin.state_dict()
-        if self._differences is None or not equal(state, self._differences[0]):
+    def _predicted(self) -> list[float]:
+        """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
+        twin, virtual = self.virtual.twin.state_dict(), self.virtual
+        if self._costs is None or not equal(twin, self._costs[0]):
             costs = list[float]()
             for flown in self.flown:
-                unknown = isinstance(self._policies[flown.role], StateFeedback)
-                again = (
-                    math.nan
-                    if unknown
-                    else self.virtual.cost(self.policy_of(flown), self.virtual.repeated(flown.trajectory))
-                )
-                costs.append(again)
-            pairs = zip(self.flown, costs, strict=True)
-            found = [math.nan if math.isnan(again) else difference(flown.cost, again) for flown, again in pairs]
-            self._differences = copy.deepcopy(state), (costs, found)
-        return self._differences[1]
+                if isinstance(self._policies[flown.role], StateFeedback):
+                    costs.append(math.nan)
+                else:
+                    costs.append(virtual.cost(self.policy_of(flown), virtual.repeated(flown.trajectory)))
+            self._costs = copy.deepcopy(twin), costs
+        return self._costs[1]
 
     def examine(self) -> TensorDict:
         """Fly the latest real episodes on the present twin.
@@ -275,11 +271,11 @@ class Belief:
         if not self.contradicted:
             return None
         whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
-        for flown, again, d in zip(self.flown, *self._predicted_again(), strict=True):
+        for flown, predicted, d in zip(self.flown, self._predicted(), self.differences(), strict=True):
             met = self.virtual.repeated(flown.trajectory).exogenous
             # State feedback is no function of an observation, a part of an episode has another cost, and where the
             # twin diverges, or nearly does, nothing is near.
-            if met.shape[1] == twin.plant.n_steps and math.isfinite(again) and d > -DEARER:
+            if met.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER:
                 whole.append(flown)
                 inputs.append(met)
                 differences.append(d)
@@ -367,7 +363,7 @@ class Belief:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
-        self._differences = self._anchored = None
+        self._costs = self._anchored = None
 
 
 def beyond(d: float, exploration: float) -> float:

@@ -360,8 +360,8 @@ class MultiStart:
         if not self.count or not isinstance(self.planner, WholeEpisodes):
             return False
         report = plan.report  # without a gradient where the twin has diverged
-        descent = [report[key].item() for key in DESCENT if key in report]
-        self._stalled = self._stalled + 1 if len(descent) < len(DESCENT) or self.planner.stalled(*descent) else 0
+        stalled = "policy_gradient" not in report or self.planner.stalled(*(report[key].item() for key in DESCENT))
+        self._stalled = self._stalled + 1 if stalled else 0
         return episode in SEVERAL or self._stalled.bit_count() == 1
 
     def _others(
