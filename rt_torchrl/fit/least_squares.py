@@ -415,11 +415,9 @@ class Estimation:
             minimum = self._descended(self.likelihood(records, prior=prior))
             return minimum._replace(iterations=done + minimum.iterations)
 
-        return (
-            descend(1)
-            if number
-            else best_of(multi_start(closure, 2, descend, first=copy.deepcopy(closure.state_dict())))
-        )
+        if number:
+            return descend(1)
+        return best_of(multi_start(closure, 2, descend, first=copy.deepcopy(closure.state_dict())))
 
     def _descended(self, likelihood: Likelihood) -> Minimum:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)

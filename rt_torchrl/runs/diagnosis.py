@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 
 from rt_torchrl.evaluation.limits import exact_optimum, predictive
-from rt_torchrl.evaluation.unseen import VALIDATION_SEED, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.steps.belief import NOISE
@@ -90,8 +90,8 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, costs: Costs) -> tuple[Cost
     def present(generator: torch.Generator) -> torch.nn.Module:
         return copy.deepcopy(policy)
 
-    chosen_on = UnseenEpisodes(unseen.plant, len(costs), seed=VALIDATION_SEED)
-    chosen_on.closure = unseen.closure
+    chosen_on = unseen.validation()
+    assert chosen_on is not None  # the closure of a twin is known
     candidates = exact_optimum(chosen_on, drawn), exact_optimum(chosen_on, present, starts=1)
     best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
     evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"

@@ -43,8 +43,8 @@ def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any],
     """What the policy of a run has cost on the system, not on the run's own twin, and the role of that policy.
 
     Returns:
-        The entry ``unseen``, or entries of the same names from the flights on the real system; and the live role,
-        or the live one, which has made these flights.
+        The entry ``unseen``, or entries of the same names from the flights on the real system; and the role of the
+        policy that was live at the end, whose costs they hold.
 
     Raises:
         ValueError: if the run was judged on its own twin alone.
