@@ -17,6 +17,7 @@ from study import Training, run_all
 
 from rt_torchrl import LoadedRun, configuration, load_run, main_of
 from rt_torchrl.figures.style import ROLES, TWIN, array, caption, legend_below, panels, role_name
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.steps.config import ROLES as POLICIES
 
 RATIOS = {
@@ -220,10 +221,9 @@ def main(config: Config) -> None:
     trainings = [Training(recipe, OPTIONS, seed, folder / f"seed-{seed}") for seed in config.seeds]
     if failures := run_all(trainings, jobs=config.jobs):
         raise ValueError("\n".join(failures))
-    runs = [load_run(training.folder) for training in trainings]
-    metrics = [run.metrics | {"seed": run.config.seed} for run in runs]
+    metrics = [read_metrics(training.folder) | {"seed": training.seed} for training in trainings]
     costs = [one["summary"]["unseen"][f"J_a_{one['summary']['live']}"]["mean"] for one in metrics]
-    run = runs[int(np.argsort(costs)[len(costs) // 2])]  # that of the median cost
+    run = load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
     drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     drawn["prediction"] = prediction(run)
     said = [table(config.plant, metrics)]
