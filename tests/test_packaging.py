@@ -155,7 +155,7 @@ ROOMS_OF = {
     "identify.py": {"fit", "figures", "runs"},
     "limit.py": {"control", "evaluation", "runs"},
     "paper.py": {"optimisers", "runs", "steps", "systems"},
-    "paper_figures.py": {"figures", "steps"},
+    "paper_figures.py": {"figures", "runs", "steps"},
     "record_log.py": {"fit", "runs"},
     "served_turbine.py": {"runs", "systems"},
     "study.py": {"atomic_file", "evaluation", "figures", "interruption", "runs", "steps"},
