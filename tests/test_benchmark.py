@@ -9,7 +9,7 @@ import fresh_process
 import pytest
 
 ROOT = Path(__file__).parent.parent
-RECIPE, PEERS = ROOT / "recipes" / "benchmark.py", ROOT / "tests" / "peers.py"
+RECIPE, PEERS = ROOT / "recipes" / "benchmark.py", ROOT / "tests" / "fast_gradients.py"
 
 
 def rows(folder, script, *options):
