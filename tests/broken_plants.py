@@ -217,6 +217,11 @@ def merit(self, states, applied, exogenous):
     return {"work [J]": (torch.zeros(self.n_steps, dtype=states.dtype) + applied[..., 0]).mean(-1)}
 
 
+@breaks("setpoints: the setpoint of 'position .m.' has shape .*expected")
+def setpoints(self, states, applied, exogenous):
+    return {"position [m]": (states[..., 0], torch.zeros((), dtype=states.dtype))}
+
+
 @breaks("step: plant 'linear_quadratic' diverged in realisation", "running_cost", A=((5000.0, 1.0), (-1.0, 0.0)))
 def cost_of_nothing(self, t, state, applied, exogenous):
     return 0.0 * state[..., 0]

@@ -206,9 +206,16 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
 
 @torch.no_grad()
 def judgement(calls: Calls) -> Iterator[str]:
-    """Violations in merit and categories of whole episodes."""
+    """Violations in merit, categories and setpoints of whole episodes."""
     state, applied, exogenous = (calls.arguments[name].transpose(0, 1) for name in ("state", "applied", "exogenous"))
     batch = len(state)
+    for key, pair in calls.plant.setpoints(state, applied, exogenous).items():
+        for what, value in zip(("value", "setpoint"), pair, strict=True):
+            if problem := misshapen(value, state.shape[:2]):
+                yield (
+                    f"setpoints: the {what} of {key!r} has {problem} for {batch} episodes of {state.shape[1]} control "
+                    f"intervals; expected {wanted_as(state.shape[:2])}."
+                )
     judged = {
         "merit": (calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]), torch.float64),
         "categories": (calls.plant.categories(exogenous), torch.bool),
