@@ -28,6 +28,7 @@ def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapsh
         live="model_based",
         record=Trajectory(flown.states[0], flown.actions[0], exogenous[0]),
         replay=replayed.states[0],
+        segment=0,
         large_scale=exogenous[0] + shift,
         realisations=exogenous if realisations else None,
         episodes=list(episodes),

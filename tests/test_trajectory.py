@@ -363,6 +363,46 @@ def test_a_weight_may_be_a_number_without_a_dimension(native, monkeypatch):
     torch.testing.assert_close(own.sensitivities(*given)[1], whole[..., 2:3])
 
 
+class Solved(LinearQuadratic):
+    """The oracle plant, whose rates solve equations M(s) ds/dt = M(s) f, as those of bodies with joints do."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state, action, exogenous, closure)
+        M = torch.diag_embed(2.0 + state.cos()) + 0.1 * state.unsqueeze(-1) * state.unsqueeze(-2)
+        return torch.linalg.solve(M, (M @ rates.unsqueeze(-1)).squeeze(-1))
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_rates_may_solve_linear_equations(native, monkeypatch):
+    """With gradients off, PyTorch mixes the rows in batched Jacobians of a solution."""
+    twin, flown, exogenous = recorded(LinearQuadratic(horizon=1.0))
+    solved = DigitalTwin(Solved(horizon=1.0), twin.closure)
+    if not native:
+        monkeypatch.setattr(solved.sensitivities._engine, "own_end_states", lambda *given: None)
+    given = flown.states[:, 0], exogenous, flown.actions
+    for found, expected in zip(solved.sensitivities(*given), twin.sensitivities(*given), strict=True):
+        torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("segment", [0, 1, 7])
+def test_a_replay_begins_anew_in_each_segment_and_is_no_number_where_it_diverges(segment):
+    """Errors grow from where a replay begins; the last interval of a record has an input that no twin survives."""
+    twin, flown, exogenous = recorded(LinearQuadratic(horizon=1.0), batch=1)
+    record = flown._replace(exogenous=exogenous).each()[0]
+    found, n = twin.replayed(record, segment), len(record.actions)
+    for k in range(1, n + 1):
+        first = (k - 1) // segment * segment if segment else 0
+        rows = slice(first, k)
+        end = twin.replay(record.states[first, None], exogenous[:, rows], flown.actions[:, rows]).states[0, -1]
+        torch.testing.assert_close(found[k], end)
+    wild = record._replace(
+        exogenous=torch.cat([record.exogenous[:-1], torch.full((1, 1), 1.7e308, dtype=torch.float64)])
+    )
+    lost = twin.replayed(wild, segment)
+    first = (n - 1) // segment * segment if segment else 0
+    assert lost[first + 1 :].isnan().all() and torch.equal(lost[: first + 1], found[: first + 1])
+
+
 def test_matrix_is_the_hessian_where_the_residual_vanishes():
     """At the true weights the Gauss-Newton matrix is the Hessian of J_p, here by differences of exact gradients."""
     plant = LinearQuadratic(horizon=2.0)

@@ -103,9 +103,16 @@ def test_a_twin_is_judged_by_what_sensors_read():
     unseen = UnseenEpisodes(real(), 3)
     flown = unseen.fly(LinearGain([[0.3, 0.3]]))
     read = flown.states[..., :2]
-    replayed = Rollout(BASE, BASE.closure)(read[:, 0], flown.exogenous, flown.actions)
+    rollout = Rollout(BASE, BASE.closure)
+    replayed = rollout(read[:, 0], flown.exogenous, flown.actions)
     expected = identification_cost(BASE, replayed, read)
     torch.testing.assert_close(unseen.identification_costs(BASE, BASE.closure, flown), expected)
+    halves = [flown.part(first, first + 10, BASE.dt) for first in (0, 10)]
+    read = [half.states[..., :2] for half in halves]
+    both = [rollout(s[:, 0], half.exogenous, half.actions) for s, half in zip(read, halves, strict=True)]
+    costs = [identification_cost(BASE, replayed, s) for replayed, s in zip(both, read, strict=True)]
+    found = unseen.identification_costs(BASE, BASE.closure, flown, segment=10)
+    torch.testing.assert_close(found, 0.5 * (costs[0] + costs[1]))
     assert unseen.judge(flown).control_costs.tolist() == pytest.approx(control_cost(real(), flown).tolist())
 
 

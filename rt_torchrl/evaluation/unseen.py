@@ -171,7 +171,7 @@ class UnseenEpisodes:
         return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
-    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
         The twin begins with what sensors read, and is compared with it. J_p is infinite where the twin diverges.
@@ -180,20 +180,25 @@ class UnseenEpisodes:
             physics: physics of the twin, which need not be that of the real system.
             closure: closure of the twin.
             flown: the episodes as flown on the real system.
+            segment: number of control intervals of the segments over which J_p is the mean, as in step 4; 0 for whole
+                episodes.
         """
         rollout = Rollout(physics, closure, compiled=self._compiled)
+        episodes = len(flown.states)
+        flown = flown.segments(segment, physics.dt) if segment else flown
         measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
 
         def costs(some: slice) -> Float[Tensor, " some"]:
+            start = flown.start[some] if isinstance(flown.start, Tensor) else flown.start
             try:
-                replayed = rollout(measured[some, 0], flown.exogenous[some], flown.actions[some])
+                replayed = rollout(measured[some, 0], flown.exogenous[some], flown.actions[some], start=start)
             except DivergenceError:
                 count = len(measured[some])
                 each = [slice(k, k + 1) for k in range(*some.indices(len(measured)))]
                 return torch.cat([costs(one) for one in each]) if count > 1 else measured.new_full((1,), torch.inf)
             return identification_cost(physics, replayed, measured[some])
 
-        return costs(slice(len(measured)))
+        return costs(slice(len(measured))).unflatten(0, (episodes, -1)).mean(1)
 
 
 class TwinEpisodes(UnseenEpisodes):
@@ -237,7 +242,7 @@ class TwinEpisodes(UnseenEpisodes):
 
         return flown(self.flying.at_rest(self.initial_state), self.exogenous)
 
-    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""
         return torch.full((len(flown.states),), torch.nan, dtype=torch.float64, device=flown.states.device)
 

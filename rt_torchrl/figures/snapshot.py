@@ -28,6 +28,7 @@ class Snapshot:
         live: role of the live policy.
         record: the last real episode, or its longest sound part.
         replay: states of the believed twin with the record's actions and exogenous input.
+        segment: number of control intervals after which the replay begins anew in the record; 0 for never.
         large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin, or the record
             is a part of an episode.
         realisations: samples of the exogenous process of the record; None as ``large_scale``.
@@ -42,6 +43,7 @@ class Snapshot:
     live: Role
     record: Trajectory
     replay: Float[Tensor, "samples n_s"]
+    segment: int
     large_scale: Float[Tensor, "n n_acting"] | None
     realisations: Float[Tensor, "k n n_acting"] | None
     episodes: list[dict[str, Any]]
@@ -67,7 +69,8 @@ class Snapshot:
             policies=algorithm.policies,
             live=algorithm.referee.live,
             record=record,
-            replay=twin.replayed(record),
+            replay=twin.replayed(record, algorithm.assimilation.length),
+            segment=algorithm.assimilation.length,
             large_scale=None if process is None else process.mean[:n],
             realisations=None if process is None else process.sample(5, generator)[:, :n],
             episodes=episodes,

@@ -67,12 +67,13 @@ def states(snapshot: Snapshot) -> Figure:
     """Every state over time, as measured and as the twin replays it with the same actions, and the RMS difference."""
     signals, real, twin = snapshot.plant.states, array(snapshot.record.states), array(snapshot.replay)
     columns = 1 if len(signals) <= 3 else 2
+    anew = f", replayed in segments of {snapshot.segment} intervals" if snapshot.segment else ""
     figure, axes, time = style.timeline(
         snapshot.plant,
         len(real) - 1,
         len(signals),
         columns,
-        title=f"Real and twin states, episode {style.last_episode(snapshot)}",
+        title=f"Real and twin states, episode {style.last_episode(snapshot)}{anew}",
         size=(7.5 + 3.5 * (columns - 1), 1.0 + 1.9 * -(-len(signals) // columns)),
     )
     for k, (ax, signal) in enumerate(zip(axes, signals, strict=True)):

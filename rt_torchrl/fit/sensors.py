@@ -18,6 +18,7 @@ from torch import Tensor
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Input, Inputs, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Named, Preview, state_read
+from rt_torchrl.trajectories.engines.interval import batched
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
 
@@ -140,7 +141,7 @@ def read_slopes(
     def reading(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
         return read(sensors, plant, t, state, z)
 
-    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
+    slopes: Tensor = batched(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
     return slopes
 
 

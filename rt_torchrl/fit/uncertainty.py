@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
 from rt_torchrl.fit.likelihood import Likelihood
+from rt_torchrl.trajectories.engines.interval import batched
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
@@ -295,7 +296,7 @@ def band(
         outputs: Tensor = torch.func.functional_call(closure, weights, (point,))
         return outputs[..., output]
 
-    slopes = torch.func.vmap(torch.func.jacrev(value), in_dims=(None, 0))(trained, features)
+    slopes = batched(torch.func.jacrev(value), in_dims=(None, 0))(trained, features)
     J = torch.cat([slope.flatten(1) for slope in slopes.values()], -1)
     variance = ((J @ uncertainty.weights_covariance) * J).sum(-1)
     deviation = torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())

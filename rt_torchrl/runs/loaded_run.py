@@ -196,7 +196,7 @@ class LoadedRun:
         record = self.simulate(self.policy(live), seed=UNSEEN_SEED) if flown is None else flown
         record = record if record.states.dim() == 2 else record.each()[0]
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
-        replay = self.twin.replayed(read)
+        segment = self.metrics["summary"].get("twin", {}).get("segment", 0)
         process, signals = None, self.physics.acting_inputs
         if self.config.twinning.arm != "model_free" and signals:
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
@@ -213,7 +213,8 @@ class LoadedRun:
             policies={role: self.policy(role) for role in ("model_free", "model_based")},
             live=live,
             record=read,
-            replay=replay,
+            replay=self.twin.replayed(read, segment),
+            segment=segment,
             large_scale=None if process is None else process.mean,
             realisations=None if process is None else process.sample(5, torch.Generator().manual_seed(0)),
             episodes=self.metrics["episodes"],

@@ -163,10 +163,13 @@ def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"]
 def twin_costs(
     unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module, flown: Trajectory
 ) -> list[Float[Tensor, " count"]]:
-    """J_p of the believed twin, and of the twin with its initial closure, on the unseen episodes as flown."""
+    """J_p of the believed twin, and of the twin with its initial closure, on the unseen episodes as flown.
+
+    They are those of the segments over which the twin was last fitted.
+    """
     believed, plant = algorithm.twin.believed, algorithm.twin.plant
-    laws = ((believed.plant, believed.closure), (plant, initial_closure))
-    return [unseen.identification_costs(physics, closure, flown) for physics, closure in laws]
+    laws, segment = ((believed.plant, believed.closure), (plant, initial_closure)), algorithm.assimilation.length
+    return [unseen.identification_costs(physics, closure, flown, segment) for physics, closure in laws]
 
 
 def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
@@ -358,7 +361,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<22}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
     lines += merit_lines(unseen)
-    lines += real_lines(found.get("real_unseen"))
+    lines += real_lines(found.get("real_unseen"), found.get("twin", {}).get("segment", 0))
     paid = found["cost_of_learning"]
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
@@ -376,14 +379,15 @@ def results_table(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def real_lines(found: dict[str, Any] | None) -> list[str]:
+def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
     """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
     if found is None:
         return []
     lines = []
     if "J_p" in found:
         before, after = (_number(found[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
-        lines.append(f"  J_p on the real system: {after}, with the first closure {before}")
+        over = f", over segments of {segment} intervals" if segment else ""
+        lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
     for name, one in found["controllers"].items():
         mean, who = _number(one["J_a"]["mean"], ".5g"), name.replace("_", "-")
         lines.append(f"  J_a on the real system, {one['episodes']} flights of {who}: {mean} {_interval(one['J_a'])}")

@@ -9,7 +9,9 @@ trajectory's. They give the gradient, the Gauss-Newton matrix and the Fisher inf
 cost grows with the number of weights, unlike that of an adjoint: they are for up to some hundred weights.
 """
 
+import contextlib
 import copy
+import math
 from collections.abc import Callable
 from functools import partial
 from itertools import accumulate
@@ -23,10 +25,18 @@ from torch.nn import functional
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
-from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
+from rt_torchrl.trajectories.engines.interval import Drive, Interval, batched, with_weights
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.engines.parallel import over_all
-from rt_torchrl.trajectories.rollout import Engine, Rollout, able, drive_of, require_double, require_finite
+from rt_torchrl.trajectories.rollout import (
+    DivergenceError,
+    Engine,
+    Rollout,
+    able,
+    drive_of,
+    require_double,
+    require_finite,
+)
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
@@ -71,12 +81,26 @@ class DigitalTwin:
         return self._replay(initial_state, exogenous, actions, start=start)
 
     @torch.no_grad()
-    def replayed(self, record: Trajectory) -> Float[Tensor, "samples n_s"]:
-        """States of the believed twin with the actions and inputs of a whole record, as sensors read them."""
-        believed = self.believed
-        begins = believed.plant.at_rest(record.states[:1])
-        flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
-        return flown.states[0, :, : record.states.shape[-1]]
+    def replayed(self, record: Trajectory, segment: int = 0) -> Float[Tensor, "samples n_s"]:
+        """States of the believed twin with the actions and inputs of a record, as sensors read them.
+
+        They are not numbers in a segment in which the twin diverges.
+
+        Args:
+            record: the record.
+            segment: number of control intervals after which the replay begins anew in what sensors have read, because
+                an unstable twin leaves longer records; 0 for the whole record.
+        """
+        believed, n = self.believed, len(record.actions)
+        states = torch.full_like(record.states, math.nan)
+        states[0] = record.states[0]
+        for first in range(0, n, segment or n):
+            part = record.part(first, min(first + (segment or n), n), self.plant.dt)
+            begins = believed.plant.at_rest(part.states[:1])
+            with contextlib.suppress(DivergenceError):
+                flown = believed.replay(begins, part.exogenous[None], part.actions[None], start=part.start)
+                states[first + 1 : first + len(part.states)] = flown.states[0, 1:, : states.shape[-1]]
+        return states
 
     @torch.no_grad()
     def followed(self, record: Trajectory) -> Float[Tensor, "samples n_s"]:
@@ -248,7 +272,7 @@ def jacobians_of(interval: Interval, names: tuple[str, ...], starts: Tensor, dri
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
         return with_weights(interval, values, state, Drive(*drive))
 
-    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
+    rows = batched(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
     by_state, by_weights = rows(weights, starts, *drive)
     # A weight may be one number, of no dimension.
     parts = (jacobian.reshape(*by_state.shape[:2], -1) for jacobian in by_weights.values())

@@ -1,10 +1,11 @@
 """One control interval as a differentiable map, what engines do with it, and the two plain engines of PyTorch."""
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 
 from rt_torchrl.plants.plant import Plant, cost_rate, final_cost, held
 
@@ -94,6 +95,20 @@ def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor,
     }
     end: Tensor = torch.func.functional_call(interval, held, (state, drive), tie_weights=False)
     return end
+
+
+def batched(jacobian: Callable[..., Any], in_dims: int | tuple[int | None, ...] = 0) -> Callable[..., Any]:
+    """A Jacobian by ``torch.func.jacrev`` at many points at once, ``torch.func.vmap`` of it, without a graph.
+
+    Where gradients are off, PyTorch 2.15 gives wrong numbers for :func:`torch.linalg.solve` in it.
+    """
+
+    def of_all(*arguments: Any) -> Any:
+        with torch.enable_grad():
+            found = torch.func.vmap(jacobian, in_dims)(*arguments)
+        return found if torch.is_grad_enabled() else tree_map(Tensor.detach, found)
+
+    return of_all
 
 
 def march(interval: Callable[[Tensor, Drive], Tensor], initial_state: Tensor, drive: Drive) -> Tensor:
