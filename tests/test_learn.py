@@ -148,6 +148,27 @@ def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, ret
     )
 
 
+@pytest.mark.parametrize("algorithm", [name for name in METHODS if name != "relaxed_ddpg"])
+def test_an_iteration_takes_the_steps_of_torchs_adam(algorithm):
+    """Also with several critics, whose gradients lie in memory in another order than their weights."""
+    ours, others = (learner(algorithm, policy="perceptron", critic_hidden=(16, 8)) for _ in range(2))
+    ours.store(explored(20)), others.store(explored(20))
+    keys, (batch,) = batches_of(ours, 1)
+    torch.manual_seed(0)
+    Iteration(ours, "both", keys)(batch)
+    torch.manual_seed(0)
+    losses = others.loss(TensorDict(dict(zip(keys, batch, strict=True)), batch_size=[len(batch[0])]))
+    critic = losses["loss_qvalue"] if "loss_qvalue" in losses else losses["loss_value"]
+    actor = losses["loss_actor"] + losses.get("loss_alpha", 0.0)
+    weights = {"critic_adam": others.critic_adam.weights, "actor_adam": others.actor_adam.weights}
+    for name, loss in (("critic_adam", critic), ("actor_adam", actor)):
+        loss.backward(inputs=weights[name], retain_graph=True)
+    nn.utils.clip_grad_norm_(weights["actor_adam"], METHODS[algorithm].gradient_limit)
+    for name, trained in weights.items():
+        torch.optim.Adam(trained, lr=getattr(others, name).rate).step()
+        torch.testing.assert_close(getattr(ours, name).weights, trained, rtol=0, atol=1e-9)
+
+
 class Branching(LinearGain):
     def forward(self, observation):
         return super().forward(observation) * (2.0 if observation.sum() > 0 else 1.0)

@@ -454,7 +454,12 @@ class Adam:
 
     @torch.no_grad()
     def step(self, gradients: list[Tensor]) -> None:
-        """Change the weights by their gradients."""
+        """Change the weights by their gradients, whose layout in memory may differ from that of the weights."""
+        # The fused kernel reads gradients in the order of the weights, and those of several critics have another one.
+        gradients = [
+            gradient if gradient.stride() == weight.stride() else torch.empty_like(weight).copy_(gradient)
+            for weight, gradient in zip(self.weights, gradients, strict=True)
+        ]
         adam(
             cast(list[Tensor], self.weights),
             gradients,
