@@ -62,10 +62,20 @@ def reactor_cost(s, a, z):
     return 1e3 * (s[0] - z[0]) ** 2
 
 
+def drive_rates(c, s, a, z):
+    torque = c[0] * s[1] ** 2 - c[2] * s[0] - c[3] * s[0] * ca.fabs(s[0])
+    return ca.vertcat(torque / c[1], (a[0] - 0.064 * s[1] - c[0] * s[0] * s[1]) / 5.419e-3)
+
+
+def drive_cost(s, a, z):
+    return ca.sqrt(1.0 + ((z[0] - s[0]) / 10.0) ** 2) - 1.0 + 100.0 * ca.fmax(s[1] / 150.0 - 1.0, 0.0) ** 2
+
+
 SYSTEMS = {
     "reactor": System(
         "PI", reactor_rates, reactor_cost, 20, true=(7.2e10 / 60.0 * np.exp(-8750.0 / 325.0), 8750.0, 5e4 / 239e3 / 6.0)
-    )
+    ),
+    "drive": System("Cascade", drive_rates, drive_cost, 30, true=(1.7e-3, 3e-3, 0.01, 1e-4)),
 }
 
 

@@ -211,6 +211,20 @@ def test_what_does_not_fit_is_refused_before_anything_moves(options, message):
         connected(LinearQuadratic(), rig=rig, **options)
 
 
+def test_a_tuple_of_gymnasium_is_refused_until_it_is_flattened():
+    plant = Pendulum(horizon=1.0)
+    pendulum = gymnasium.make("Pendulum-v1")
+    parts = gymnasium.spaces.Tuple([gymnasium.spaces.Box(-8.0, 8.0, (n,)) for n in (2, 1)])
+    env = gymnasium.wrappers.TransformObservation(pendulum, lambda seen: (seen[:2], seen[2:]), parts)
+    with pytest.raises(ValueError, match=r"state is read from \['observation'\], .* a tuple of arrays; .*Flatten"):
+        RealSystem(GymWrapper(env), plant, state=Reading(of=angle_and_speed))
+    flat = RealSystem(
+        GymWrapper(gymnasium.wrappers.FlattenObservation(env)), plant, state=Reading(of=angle_and_speed), seed=1
+    )
+    whole = RealSystem(GymWrapper(pendulum), plant, state=Reading(of=angle_and_speed), seed=1)
+    torch.testing.assert_close(flat.reset()["state"], whole.reset()["state"])
+
+
 def test_each_report_is_read_once():
     class Ending(LinearQuadratic):
         end_cost = 10.0

@@ -65,9 +65,14 @@ class Reading:
         """The vector in the plant's units, whatever its values.
 
         Raises:
-            ValueError: if an entry is missing, or the vector does not have the shape of the signals.
+            ValueError: if an entry is missing or a tuple, or the vector does not have the shape of the signals.
         """
         self.require(reported, what)
+        if tuples := [key for key in self.keys if reported.get(key).is_nested]:
+            raise ValueError(
+                f"{what} is read from {tuples}, in which the environment reports a tuple of arrays; flatten it first, "
+                "such as GymWrapper(gymnasium.wrappers.FlattenObservation(env))."
+            )
         vector = self.of(*(reported.get(key).double() for key in self.keys))
         names = [signal.name for signal in signals]
         if tuple(vector.shape) != (*reported.batch_size, len(signals)):
