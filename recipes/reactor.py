@@ -3,62 +3,48 @@
 from functools import partial
 from typing import Any, Literal
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 
-from rt_torchrl import (
-    AssimilationConfig,
-    ClassicalController,
-    DescentConfig,
-    Measurement,
-    PlannerConfig,
-    Plant,
-    PositiveCoefficients,
-    RunConfig,
-    Signal,
-    TwinningConfig,
-    main_of,
-)
-
-FLOW, HEAT, FEED, KNOWN_AT = 1.0 / 60.0, 5e4 / 239.0, 1.0, 325.0  # q/V [1/s], −ΔH/(ρ c) [K L/mol], C_f [mol/L], T⁰ [K]
-CONCENTRATION = Signal(symbol="C", name="concentration", unit="mol/L", low=0.0)
-TEMPERATURE = Signal(symbol="T", name="temperature", unit="K")
-JACKET = Signal(symbol="T_c", name="jacket_temperature", unit="K", low=295.0, high=302.0)
-WANTED = Signal(symbol="C_s", name="set_point", unit="mol/L", low=0.0)
-INLET = Signal(symbol="T_i", name="inlet_temperature", unit="K")
+FLOW, HEAT, FEED = 1.0 / 60.0, 5e4 / 239.0, 1.0  # q/V [1/s], −ΔH/(ρ c) [K L/mol], C_f [mol/L]
+CONCENTRATION = rt.Signal(symbol="C", name="concentration", unit="mol/L", low=0.0)
+TEMPERATURE = rt.Signal(symbol="T", name="temperature", unit="K")
+JACKET = rt.Signal(symbol="T_c", name="jacket_temperature", unit="K", low=290.0, high=306.0)
+WANTED = rt.Signal(symbol="C_s", name="set_point", unit="mol/L", low=0.0)
+INLET = rt.Signal(symbol="T_i", name="inlet_temperature", unit="K")
 
 
-class Kinetics(PositiveCoefficients):
-    """What the data sheet does not know exactly: Arrhenius' law and the jacket."""
+class Kinetics(rt.PositiveCoefficients):
+    """What the data sheet knows roughly: Arrhenius' law and the jacket."""
 
     names = {"rate": "1/s", "activation": "K", "jacket": "1/s"}
     meanings = {"rate": "reaction rate at 325 K", "activation": "E/R", "jacket": "UA/(ρ c V)"}
 
 
-class Reactor(Plant):
+class Reactor(rt.Plant):
     """An exothermic reaction in a stirred tank that a jacket cools."""
 
     name = "reactor"
     states, actions, inputs = (CONCENTRATION, TEMPERATURE), (JACKET,), (WANTED, INLET)
     state_sizes = (0.05, 3.0)
     measurements = (
-        Measurement.of(CONCENTRATION, offset=0.85, scale=0.05),
-        Measurement.of(TEMPERATURE, offset=325.0, scale=3.0),
-        Measurement.of(WANTED, offset=0.85, scale=0.05),
-        Measurement.of(INLET, offset=350.0, scale=3.0),
+        rt.Measurement.of(CONCENTRATION, offset=0.85, scale=0.05),
+        rt.Measurement.of(TEMPERATURE, offset=325.0, scale=3.0),
+        rt.Measurement.of(WANTED, offset=0.85, scale=0.05),
+        rt.Measurement.of(INLET, offset=350.0, scale=3.0),
     )
 
-    def __init__(self, *, dt: float = 15.0, horizon: float = 1200.0):
+    def __init__(self, *, dt: float = 10.0, horizon: float = 900.0):
         super().__init__(dt=dt, horizon=horizon, closure=self.make_closure())
 
     def vector_field(self, t, state, action, exogenous, closure):
         (concentration, temperature), inlet = state.unbind(-1), exogenous[..., 1]
         rate, activation, jacket = closure(state).unbind(-1)
-        reaction = rate * torch.exp(activation * (1.0 / KNOWN_AT - 1.0 / temperature)) * concentration
+        reaction = rate * torch.exp(activation * (1.0 / 325.0 - 1.0 / temperature)) * concentration
         warming = HEAT * reaction + jacket * (action[..., 0] - temperature)
         return torch.stack([FLOW * (FEED - concentration) - reaction, FLOW * (inlet - temperature) + warming], -1)
 
@@ -67,12 +53,12 @@ class Reactor(Plant):
 
     def draw_initial_state(self, batch, generator):
         uniform = torch.rand(batch, 2, generator=generator, dtype=torch.float64)
-        return torch.tensor([0.8, 320.0]) + torch.tensor([0.1, 8.0]) * uniform
+        return torch.tensor([0.75, 322.0]) + torch.tensor([0.15, 8.0]) * uniform
 
     def draw_exogenous(self, batch, generator):
         levels = torch.rand(2, batch, 3, generator=generator, dtype=torch.float64)
         steps = levels.repeat_interleave(-(-self.n_steps // 3), -1)[..., : self.n_steps]
-        return torch.stack([0.8 + 0.1 * steps[0], 348.0 + 4.0 * steps[1]], -1)
+        return torch.stack([0.78 + 0.14 * steps[0], 348.0 + 4.0 * steps[1]], -1)
 
     def make_closure(self, generator=None):
         return Kinetics([0.002, 7e3, 0.03])  # the data sheet
@@ -81,75 +67,51 @@ class Reactor(Plant):
         return {"concentration [mol/L]": (states[..., 0], exogenous[..., 0])}
 
 
-class PI(ClassicalController):
+class PI(rt.ClassicalController):
     """Jacket temperature by the concentration's error and its integral, which stands still at an end of the range."""
 
     gain_units = {"proportional": "K L/mol", "integral": "K L/(mol s)"}
-    default_gains = (100.0, 1.0)
+    default_gains = (300.0, 1.0)
     memory_size = 1
 
     def law(self, state, memory, exogenous):
         proportional, integral = self.gains.unbind()
         error = state[:, :1] - exogenous[:, :1]
-        command = 298.5 + proportional * error + integral * memory
-        stuck = (command - 298.5).abs() > 3.5
+        command = 298.0 + proportional * error + integral * memory
+        stuck = (command - 298.0).abs() > 8.0
         return command, torch.where(stuck, memory, memory + self.plant.dt * error)
 
 
-def real_system(plant: Reactor, *, seed: int = 0):
-    """pcgym's reactor: its draws of an episode, and what it reports and takes."""
+def real_system(plant: Reactor, *, seed: int = 0) -> "rt.RealSystem":
+    """pcgym's reactor with the plant's draws of starts, set points and inlets, which are parameters to pcgym."""
     import numpy as np
     import pcgym
     from torchrl.envs import GymWrapper
 
-    from rt_torchrl import Reading, RealSystem
-
     class Episodes(pcgym.make_env):
-        """Episodes with other starts, set points and inlets; pcgym takes them as parameters."""
-
         def reset(self, seed=None, **options):
             draws = torch.Generator().manual_seed(seed)
-            start, course = plant.draw_initial_state(1, draws)[0], plant.draw_exogenous(1, draws)[0].numpy()
-            course = np.concatenate([course, course[-1:]])
-            self.env_params["x0"] = np.append(start.numpy(), course[0, 0])
+            start, course = plant.draw_initial_state(1, draws)[0], plant.draw_exogenous(1, draws)[0]
+            course = np.vstack([course, course[-1:]])
+            self.env_params["x0"] = np.append(start, course[0, 0])
             self.SP, self.disturbances = {"Ca": course[:, 0]}, {"Ti": course[:, 1]}
             return super().reset(seed=seed, **options)
 
     n = plant.n_steps + 1
-    ranges = {"low": np.array([0.0, 250.0, 0.0]), "high": np.array([1.0, 450.0, 1.0])}
-    machine = Episodes(
-        {
-            "model": "cstr",
-            "N": n,
-            "tsim": n * plant.dt / 60.0,
-            "x0": np.zeros(3),
-            "SP": {"Ca": [0.0] * n},
-            "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
-            "o_space": ranges,
-            "disturbances": {"Ti": [350.0] * n},
-            "disturbance_bounds": {"low": np.array([300.0]), "high": np.array([400.0])},
-            "normalise_a": False,
-            "normalise_o": False,
-        }
-    )
-    return RealSystem(
-        GymWrapper(machine),
-        plant,
-        state=Reading(of=lambda observed: observed[..., :2]),
-        exogenous=Reading(of=lambda observed: observed[..., 2:]),
-        seed=seed,
-    )
+    ranges = {
+        "a_space": {"low": np.array([JACKET.low]), "high": np.array([JACKET.high])},
+        "o_space": {"low": np.array([0.0, 250.0, 0.0]), "high": np.array([1.0, 500.0, 1.0])},
+        "disturbance_bounds": {"low": np.array([300.0]), "high": np.array([400.0])},
+    }
+    drawn = {"x0": np.zeros(3), "SP": {"Ca": [0.0]}, "disturbances": {"Ti": [350.0]}}
+    options = {"model": "cstr", "N": n, "tsim": n * plant.dt / 60.0, "normalise_a": False, "normalise_o": False}
+    state, exogenous = rt.Reading(of=lambda seen: seen[..., :2]), rt.Reading(of=lambda seen: seen[..., 2:])
+    machine = GymWrapper(Episodes(options | ranges | drawn))
+    return rt.RealSystem(machine, plant, state=state, exogenous=exogenous, seed=seed)
 
 
-TWINNING = TwinningConfig(
-    records=8,
-    assimilation=AssimilationConfig(method="levenberg_marquardt", inputs="record"),
-    planner=PlannerConfig(iterations=40, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-)
-
-
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Hold the concentration in pcgym's reactor."""
 
     policy: Literal["plant", "mlp"] = "mlp"
@@ -157,7 +119,7 @@ class Config(RunConfig):
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"
-    twinning: TwinningConfig = TWINNING
+    twinning: rt.TwinningConfig = rt.FEW_COEFFICIENTS
 
     def plant(self) -> Reactor:
         return Reactor()
@@ -165,12 +127,10 @@ class Config(RunConfig):
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run
-
     plant = config.plant()
     env = partial(real_system, plant, seed=config.seed)
-    Run(config, plant, env=env, first=PI, baselines={"PI": PI}, **parts).train()
+    rt.Run(config, plant, env=env, first=PI, baselines={"PI": PI}, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -61,6 +61,7 @@ from .steps.learn import ActorCritic, Learner, LearningMethod
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
 from .steps.config import (
+    FEW_COEFFICIENTS,
     PAPER,
     AssimilationConfig,
     ConstraintsConfig,
@@ -95,6 +96,7 @@ __version__: str
 
 __all__ = [
     "DISCON",
+    "FEW_COEFFICIENTS",
     "PAPER",
     "ActorCritic",
     "Actuation",

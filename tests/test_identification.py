@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_plants import flown
+from small_plants import Line, flown, line_segment
 from test_export_recipe import recipe
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -22,7 +22,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 pd = pytest.importorskip("pandas")
@@ -183,6 +183,26 @@ def test_of_segments_that_are_followed_alike_the_longest_stay():
         return length, torch.tensor([errors[length]])
 
     assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 30 and (closure.matrix == 30.0).all()
+
+
+class Runaway(Line):
+    """ẏ = a y³ − y, which is infinite after 0.73 s for a = 1.3 and y(0) = 1, and decays for a = 0.5."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return closure(state) * state**3 - state
+
+
+def test_a_twin_that_diverges_over_whole_records_begins_with_what_short_segments_tell():
+    plant, t = Runaway(), 0.1 * np.arange(101)
+    closure = PositiveCoefficients([1.3], names={"a": "1/s"})
+    record = line_segment((0.5 + 0.5 * np.exp(2.0 * t)) ** -0.5)
+    twin = DigitalTwin(plant, closure)
+    config = AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt")
+    fit = Assimilation(twin, config)
+    assert fit.cost_of(batch_of([record])) == np.inf
+    found = fit.update([record], [], 1, torch.Generator())
+    assert fit.length == 0 and found.start == np.inf and found.best < 1e-10
+    assert closure.coefficients.item() == pytest.approx(0.5, rel=1e-4)
 
 
 @pytest.fixture(scope="module")

@@ -80,8 +80,8 @@ def states(snapshot: Snapshot) -> Figure:
         ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label="real")
         ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         rms = np.sqrt(np.mean((twin[:, k] - real[:, k]) ** 2))
-        rms = rms if rms > 1e-10 * np.abs(real[:, k]).max() else 0.0
-        caption(ax, signal.label, f"RMS {style.with_unit(rms, signal.unit)}")
+        rms = 0.0 if rms <= 1e-10 * np.abs(real[:, k]).max() else rms
+        caption(ax, signal.label, f"RMS {'diverges' if np.isnan(rms) else style.with_unit(rms, signal.unit)}")
     legend_below(figure, axes[:1])
     return figure
 

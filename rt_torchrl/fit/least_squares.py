@@ -127,15 +127,16 @@ def over_segments(
 ) -> R:
     """Fit whole records; those of an unstable twin over the longest segments that it follows as well as shorter ones.
 
-    Where the errors over whole records are not small enough, short segments are fitted from the same weights. If the
-    twin is stable under what these tell, it lacks something that no segment shows better, and whole records stay.
-    Otherwise segments of a third of the records are fitted, then of a ninth, and so on.
+    Where the errors over whole records are not small enough, short segments are fitted from the same weights. Where the
+    twin diverges over whole records, they are fitted again, from what the short segments tell. If the twin is stable
+    under that, it lacks something that no segment shows better, and whole records stay. Otherwise segments of a third
+    of the records are fitted, then of a ninth, and so on.
 
     Args:
         closure: closure with the weights; those of the fit that is returned stay.
         intervals: number of control intervals of the longest record.
         fit: function of the number of control intervals of a segment, or 0 for whole records, that moves the weights
-            and returns the result and its RMS errors.
+            and returns the result and its RMS errors; these are infinite, or it raises, where the twin diverges.
         enough: RMS errors that are small enough.
         unstable: whether the twin is unstable under the present weights; see :meth:`Estimation.unstable`.
 
@@ -161,7 +162,10 @@ def over_segments(
     if not whole and short < intervals:
         explains(short)
         probed = fits.pop(short, None)
-        whole = 0 in fits and probed is not None and not unstable()
+        if probed is not None and not (0 in fits and fits[0][1].isfinite().all()):
+            start = probed[2]
+            whole = explains(0)
+        whole = whole or (0 in fits and probed is not None and not unstable())
     length = 0
     while not whole and length != 1:
         length = max((length or intervals) // SHORTENED, 1)

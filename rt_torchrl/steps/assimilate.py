@@ -138,12 +138,14 @@ class Assimilation:
     def _over_chosen_segments(self, whole: Trajectory) -> Descended:
         """Descend over whole records, or over segments if the twin is unstable and leaves these."""
         sensors, begun = self._problem.sensors, copy.deepcopy(self._progress())
-        records = sensor_records(self.twin.plant, sensors, whole)
+        records, before = sensor_records(self.twin.plant, sensors, whole), dict[int, float]()
 
         def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
             self._resume(copy.deepcopy(begun))
             self.length = min(length, whole.actions.shape[1])
             found = self._descend_anew(self.in_segments(whole))
+            # The first fit of a length begins with the present closure.
+            found = found._replace(start=before.setdefault(length, found.start))
             return (found, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
 
         found, self.length, progress = over_segments(

@@ -313,3 +313,12 @@ PAPER = TwinningConfig(
 )
 """The paper's algorithm, with the numbers of its first test case (Table 1, row T1). Of what the paper does not print,
 τ is 0.02, with which the critic stays finite, and optimisers, their rates and the exploration are the library's."""
+
+FEW_COEFFICIENTS = TwinningConfig(
+    records=8,
+    learner=LearnerConfig(critic_iterations=200, actor_iterations=200),
+    assimilation=AssimilationConfig(method="levenberg_marquardt", inputs="record"),
+    planner=PlannerConfig(iterations=40, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+)
+"""For a plant with at most some ten unknown coefficients, whose inputs are measured: step 4 solves least squares over
+the last eight records, and step 5 descends by L-BFGS."""
