@@ -1,6 +1,7 @@
 """Options of configurations and recipes: presets, bounds, and what a command line tells in one line."""
 
 import dataclasses
+import importlib
 import json
 import math
 import re
@@ -335,9 +336,18 @@ def _no_words(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["recipe.py"])
 
 
+def without_a_package(config):
+    try:
+        import not_installed  # noqa: F401
+    except ImportError as error:
+        raise RuntimeError("as Gymnasium says it") from error
+
+
 @pytest.mark.parametrize(
     ("main", "message"),
     [
+        (lambda config: importlib.import_module("not_installed.part"), "the package not_installed is not installed"),
+        (without_a_package, "the package not_installed is not installed; .* --extra EXTRA"),
         (lambda config: Path("gone.bts").read_text(), "No such file or directory: 'gone.bts'"),
         (lambda config: dataclasses.replace(config, seed=-1), "seed=-1 must be"),
     ],

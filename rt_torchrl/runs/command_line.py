@@ -49,7 +49,8 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line.
 
     An error that this library or one of its recipes raises, or the operating system, is one line, because it says what
-    to mend. Any other one keeps its traceback, such as one inside PyTorch or in a plant of the user's own.
+    to mend, and so is a package that is missing. Any other one keeps its traceback, such as one inside PyTorch or in a
+    plant of the user's own.
     """
     quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
     try:
@@ -57,6 +58,12 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     except Exception as error:
         if isinstance(error, OSError) or _is_for_users(error):
             raise SystemExit(f"error: {error}") from error
+        missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
+        if isinstance(missing, ModuleNotFoundError):
+            raise SystemExit(
+                f"error: the package {missing.name} is not installed; the page of the recipe says which extra of "
+                "rt_torchrl brings it, uv run --extra EXTRA."
+            ) from error
         raise
     except KeyboardInterrupt:
         sys.exit(130)  # as shells report Ctrl-C
