@@ -71,11 +71,37 @@ def drive_cost(s, a, z):
     return ca.sqrt(1.0 + ((z[0] - s[0]) / 10.0) ** 2) - 1.0 + 100.0 * ca.fmax(s[1] / 150.0 - 1.0, 0.0) ** 2
 
 
+def double_pendulum_rates(c, s, a, z):
+    import double_pendulum as p
+
+    lower, upper, coupling = s[1], s[1] + s[2], p.UPPER * p.LENGTH
+    first, second, both = s[4], s[5], s[4] + s[5]
+    rows = (
+        (p.TOTAL, p.BOTH * ca.cos(lower), p.UPPER * ca.cos(upper)),
+        (p.BOTH * ca.cos(lower), p.SWUNG, coupling * ca.cos(s[2])),
+        (p.UPPER * ca.cos(upper), coupling * ca.cos(s[2]), p.TURNED),
+    )
+    forces = ca.vertcat(
+        c[0] * a - c[1] * s[3] + p.BOTH * ca.sin(lower) * first**2 + p.UPPER * ca.sin(upper) * both**2,
+        p.BOTH * p.GRAVITY * ca.sin(lower) + coupling * ca.sin(s[2]) * both**2 - c[2] * (first - second),
+        p.UPPER * p.GRAVITY * ca.sin(upper) - coupling * ca.sin(s[2]) * first**2 - c[2] * second,
+    )
+    up = ca.solve(ca.vertcat(*(ca.horzcat(*row) for row in rows)), forces)
+    return ca.vertcat(s[3:], up[0], up[1], up[2] - up[1])
+
+
+def double_pendulum_cost(s, a, z):
+    lower, upper = s[1], s[1] + s[2]
+    across, height = s[0] + 0.6 * (ca.sin(lower) + ca.sin(upper)), 0.6 * (ca.cos(lower) + ca.cos(upper))
+    return 0.01 * across**2 + (height - 2.0) ** 2 - 0.64 + 1e-3 * s[4] ** 2 + 5e-3 * s[5] ** 2
+
+
 SYSTEMS = {
     "reactor": System(
         "PI", reactor_rates, reactor_cost, 20, true=(7.2e10 / 60.0 * np.exp(-8750.0 / 325.0), 8750.0, 5e4 / 239e3 / 6.0)
     ),
     "drive": System("Cascade", drive_rates, drive_cost, 30, true=(1.7e-3, 3e-3, 0.01, 1e-4)),
+    "double_pendulum": System("LQR", double_pendulum_rates, double_pendulum_cost, 60, true=(500.0, 0.05, 0.05)),
 }
 
 

@@ -35,3 +35,14 @@ def test_the_drive_follows_its_reference_better_than_its_cascade(tmp_path):
     assert costs[summary["live"]] < costs["cascade"]
     true = {"excitation": 1.7e-3, "inertia": 3e-3, "friction": 0.01, "fan": 1e-4}
     assert summary["closure"]["found"] == pytest.approx(true, rel=1e-2)
+
+
+@pytest.mark.nightly
+def test_the_double_pendulum_is_held_better_than_by_its_regulator(tmp_path):
+    pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    summary, costs = trained("double_pendulum", tmp_path, "--episodes", "3")
+    assert costs[summary["live"]] < 0.7 * costs["LQR"]
+    found = summary["closure"]["found"]
+    assert found["drive"] == pytest.approx(500.0, rel=1e-3)
+    # The upright pendulum hardly turns in its joints, and the rail's 0.05 N s/m are lost beside 500 N.
+    assert found["joint_friction"] == pytest.approx(0.05, rel=0.1)

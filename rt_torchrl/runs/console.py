@@ -12,7 +12,7 @@ from pathlib import Path
 PROGRAM = "rt-torchrl"
 PACKAGE = Path(__file__).resolve().parent.parent
 HELP = ("-h", "--help")
-FIRST = ("wind_turbine", "flapping_wing", "cryogenic_tank", "cascaded_tanks", "pendulum", "reactor", "drive")
+FIRST = "wind_turbine flapping_wing cryogenic_tank cascaded_tanks pendulum reactor drive double_pendulum".split()
 """Recipes that train on a plant; the list begins with them."""
 
 
