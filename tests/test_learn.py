@@ -416,21 +416,23 @@ def test_all_is_drawn_from_the_learners_generator(algorithm):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "updates", "options"),
+    ("algorithm", "updates", "spread", "options"),
     [
         # Measured at the end: 0.07 to 0.09 of ‖K*‖.
-        pytest.param("ddpg", 45, {"actor_iterations": 20, "actor_rate": 0.02}, id="ddpg"),
+        pytest.param("ddpg", 45, 1.0, {"actor_iterations": 20, "actor_rate": 0.02}, id="ddpg"),
         # The lower of two critics leans towards small actions.
-        pytest.param("td3", 30, {"actor_rate": 0.01}, id="td3", marks=pytest.mark.nightly),
-        pytest.param("sac", 30, {"actor_rate": 0.01}, id="sac", marks=pytest.mark.nightly),
+        pytest.param("td3", 30, 1.0, {"actor_rate": 0.01}, id="td3", marks=pytest.mark.nightly),
+        # From wider states a third of the actions of K* are at their bounds, where they have the least entropy: SAC
+        # pays for that with 3 % of the cost.
+        pytest.param("sac", 20, 0.3, {"actor_rate": 0.01}, id="sac", marks=pytest.mark.nightly),
     ],
 )
-def test_policy_finds_the_optimal_gain(algorithm, updates, options, unchecked):
+def test_policy_finds_the_optimal_gain(algorithm, updates, spread, options, unchecked):
     """On 5000 transitions of a noise-free plant."""
     best = optimal_gain(GAMMA)
     critic = {"critic_hidden": (64, 64), "critic_iterations": 100, "critic_rate": 3e-3, "target_rate": 0.05}
     found = learner(algorithm, batch_size=256, **critic, **options)
-    start, data = found.policy.gain.detach().numpy().copy(), explored(1000, spread=1.0)
+    start, data = found.policy.gain.detach().numpy().copy(), explored(1000, spread=spread)
     filled(data, found, prioritisation=0.0)
     for _ in range(updates):
         found.update()
