@@ -1,41 +1,26 @@
 """Reinforcement twinning of gym-electric-motor's series DC motor, whose speed is to follow a reference."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
-
-from rt_torchrl import (
-    AssimilationConfig,
-    ClassicalController,
-    DescentConfig,
-    ExogenousConfig,
-    LearnerConfig,
-    Measurement,
-    PlannerConfig,
-    Plant,
-    PositiveCoefficients,
-    RunConfig,
-    Signal,
-    TwinningConfig,
-    main_of,
-)
 
 RESISTANCE, INDUCTANCE = 0.064, 5.419e-3  # R [Ω], L [H]
 EXCITATION, INERTIA = 2.2e-3, 2e-3  # L' [H], J [kg m²]: the data sheet's
 VOLTAGE, CURRENT, TRIP, FASTEST = 60.0, 150.0, 210.0, 300.0  # V, A for a short time, A that trips the drive, rad/s
-SPEED = Signal(symbol=r"\omega", name="speed", unit="rad/s")
-ARMATURE = Signal(symbol="i", name="current", unit="A")
-CHOPPER = Signal(symbol="u", name="voltage", unit="V", low=0.0, high=VOLTAGE)
-REFERENCE = Signal(symbol=r"\omega^*", name="reference", unit="rad/s")
+SPEED = rt.Signal(symbol=r"\omega", name="speed", unit="rad/s")
+ARMATURE = rt.Signal(symbol="i", name="current", unit="A")
+CHOPPER = rt.Signal(symbol="u", name="voltage", unit="V", low=0.0, high=VOLTAGE)
+REFERENCE = rt.Signal(symbol=r"\omega^*", name="reference", unit="rad/s")
 
 
-class MotorAndLoad(PositiveCoefficients):
+class MotorAndLoad(rt.PositiveCoefficients):
     """What the data sheet does not know exactly: the motor's flux, and what turns with it and against it."""
 
     names = {"excitation": "H", "inertia": "kg m^2", "friction": "N m s", "fan": "N m s^2"}
@@ -45,16 +30,16 @@ def error(plant, t, state, exogenous):
     return exogenous[..., 0] - state[..., 0]
 
 
-class Drive(Plant):
+class Drive(rt.Plant):
     """A chopper, a series DC motor and a fan; the drive trips at too much current."""
 
     name = "drive"
     states, actions, inputs = (SPEED, ARMATURE), (CHOPPER,), (REFERENCE,)
     state_sizes = (10.0, 10.0)
     measurements = (
-        Measurement.of(SPEED, offset=150.0, scale=100.0),
-        Measurement.of(ARMATURE, offset=60.0, scale=50.0),
-        Measurement(symbol="e", name="error", unit="rad/s", read=error, scale=20.0),
+        rt.Measurement.of(SPEED, offset=150.0, scale=100.0),
+        rt.Measurement.of(ARMATURE, offset=60.0, scale=50.0),
+        rt.Measurement(symbol="e", name="error", unit="rad/s", read=error, scale=20.0),
     )
     end_cost = 100.0
 
@@ -94,7 +79,7 @@ class Drive(Plant):
         return {"RMS error [rad/s]": square.mean(-1).sqrt(), "greatest current [A]": states[..., 1].amax(-1)}
 
 
-class Cascade(ClassicalController):
+class Cascade(rt.ClassicalController):
     """PI of the speed, whose torque asks for a current, and PI of the current around the back-EMF."""
 
     gain_units = {"speed_loop": "rad/s", "current_loop": "rad/s"}
@@ -122,8 +107,6 @@ def real_system(plant: Drive, *, seed: int = 0):
     from gymnasium.wrappers import FlattenObservation
     from torchrl.envs import GymWrapper
 
-    from rt_torchrl import Actuation, Reading, RealSystem
-
     machine = ContSpeedControlDcSeriesMotorEnv(
         tau=plant.dt,
         load=PolynomialStaticLoad({"b": 0.01, "c": 1e-4, "j_load": 5e-4}),
@@ -132,28 +115,22 @@ def real_system(plant: Drive, *, seed: int = 0):
     )
     read = [machine.state_names.index(name) for name in ("omega", "i")]
     limits = machine.limits[read]  # it reports shares of these
-    return RealSystem(
+    return rt.RealSystem(
         GymWrapper(FlattenObservation(machine)),
         plant,
-        state=Reading(of=lambda observed: observed[..., read], scale=limits),
-        exogenous=Reading(of=lambda observed: observed[..., -1:], scale=limits[0]),
-        actuation=Actuation(scale=VOLTAGE),
+        state=rt.Reading(of=lambda observed: observed[..., read], scale=limits),
+        exogenous=rt.Reading(of=lambda observed: observed[..., -1:], scale=limits[0]),
+        actuation=rt.Actuation(scale=VOLTAGE),
         seed=seed,
     )
 
 
-TWINNING = TwinningConfig(
-    # Beside a twin a hundred iterations end where more end.
-    learner=LearnerConfig(critic_iterations=100, actor_iterations=100),
-    # Six references do not hold the rare ones that cost most.
-    exogenous=ExogenousConfig(large_scale="mixed"),
-    assimilation=AssimilationConfig(method="levenberg_marquardt", inputs="record"),
-    planner=PlannerConfig(iterations=60, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-)
+# A reference is known beforehand, and one of them says nothing of the next one.
+TWINNING = replace(rt.FEW_COEFFICIENTS, exogenous=rt.ExogenousConfig(large_scale="drawn"))
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Let the speed of gym-electric-motor's series DC motor follow a reference.
 
     Args:
@@ -165,7 +142,7 @@ class Config(RunConfig):
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"
-    twinning: TwinningConfig = TWINNING
+    twinning: rt.TwinningConfig = TWINNING
 
     def plant(self) -> Drive:
         return Drive()
@@ -173,12 +150,10 @@ class Config(RunConfig):
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run
-
     plant = config.plant()
     env = partial(real_system, plant, seed=config.seed)
-    Run(config, plant, env=env, first=Cascade, baselines={"cascade": Cascade}, **parts).train()
+    rt.Run(config, plant, env=env, first=Cascade, baselines={"cascade": Cascade}, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -119,7 +119,11 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run --extra tank tests/ruler.py"}  # tests/test_results.py
     known |= {"uv run --group nightly tests/fast_gradients.py"}  # tests/test_benchmark.py
-    known |= {command for command in rest if re.fullmatch(r"uv run --group nightly tests/peers\.py \w+", command)}
+    known |= {
+        command
+        for command in rest
+        if re.fullmatch(r"uv run --group nightly tests/peers\.py \w+( --judged \d+)?", command)
+    }
     known |= {"uv run --extra tank docs/gallery.py"}  # tests/test_documentation.py
     known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
     known |= {f"{PYTEST} -m faults"}

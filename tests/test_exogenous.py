@@ -179,3 +179,15 @@ def test_large_scales_are_mixed_from_the_third_episode_on():
     assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
     low, high = plant.inputs[0].low, plant.inputs[0].high
     assert (seen[3] >= low).all() and (seen[3] <= high).all()
+
+
+def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():
+    plant = WindTurbine(horizon=60.0, observe=("preview",))
+    virtual = VirtualEpisodes(
+        DigitalTwin(plant, plant.closure), ExogenousConfig(large_scale="drawn"), 3, generator=seeded()
+    )
+    record = torch.full((plant.n_steps, 1), 5.0, dtype=torch.float64)
+    virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.acting_inputs))
+    episodes, generator = virtual.draw(200), seeded()
+    assert torch.equal(episodes.initial_state, plant.draw_initial_state(200, generator))
+    assert torch.equal(episodes.exogenous, plant.draw_exogenous(200, generator))

@@ -321,7 +321,7 @@ class VirtualEpisodes:
         return ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config)
 
     def draw(self, count: int, *, recorded: bool = False) -> Scenario:
-        """Draw initial states, and exogenous inputs from the processes that are kept.
+        """Draw initial states, and exogenous inputs from the processes that are kept or as the plant draws them.
 
         Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
         states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
@@ -338,6 +338,8 @@ class VirtualEpisodes:
             initial_state = self.recorded.repeat(count, 1)
         else:
             initial_state = plant.draw_initial_state(count, self.generator)
+        if large_scale == "drawn":
+            return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
         exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
         return Scenario(initial_state, plant.with_previews(exogenous))
 
