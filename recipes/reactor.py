@@ -1,7 +1,7 @@
 """Reinforcement twinning of pcgym's stirred-tank reactor, whose set point and inlet change."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import rt_torchrl as rt
 
@@ -99,9 +99,9 @@ def real_system(plant: Reactor, *, seed: int = 0) -> "rt.RealSystem":
 
     n = plant.n_steps + 1
     ranges = {
-        "a_space": {"low": np.array([JACKET.low]), "high": np.array([JACKET.high])},
-        "o_space": {"low": np.array([0.0, 250.0, 0.0]), "high": np.array([1.0, 500.0, 1.0])},
-        "disturbance_bounds": {"low": np.array([300.0]), "high": np.array([400.0])},
+        "a_space": {"low": np.float32([JACKET.low]), "high": np.float32([JACKET.high])},
+        "o_space": {"low": np.float32([0.0, 250.0, 0.0]), "high": np.float32([1.0, 500.0, 1.0])},
+        "disturbance_bounds": {"low": np.float32([300.0]), "high": np.float32([400.0])},
     }
     drawn = {"x0": np.zeros(3), "SP": {"Ca": [0.0]}, "disturbances": {"Ti": [350.0]}}
     options = {"model": "cstr", "N": n, "tsim": n * plant.dt / 60.0, "normalise_a": False, "normalise_o": False}
@@ -114,8 +114,6 @@ def real_system(plant: Reactor, *, seed: int = 0) -> "rt.RealSystem":
 class Config(rt.RunConfig):
     """Hold the concentration in pcgym's reactor."""
 
-    policy: Literal["plant", "mlp"] = "mlp"
-    hidden: tuple[int, ...] = (16, 16)
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"

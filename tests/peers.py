@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -270,11 +271,15 @@ class Comparison:
     def predictive(self, coefficients):
         return Result(self.cost(Predictive(self.plant, self.system, coefficients)))
 
-    def learned(self, seed, algorithm, times):
+    def beside(self, seed, *, times, algorithm):
+        """A learner after this many times the real episodes of the recipe."""
+        return self.learned(seed, algorithm, times * self.twinning(seed).episodes)
+
+    def learned(self, seed, algorithm, episodes):
         """A learner of stable-baselines3 with its default options."""
         env = Environment(self.recipe.real_system(self.plant, seed=seed))
         learner = getattr(stable_baselines3, algorithm)("MlpPolicy", env, seed=seed, device="cpu")
-        episodes, start = times * self.twinning(seed).episodes, time.perf_counter()
+        start = time.perf_counter()
         # Episodes may end early: they are counted, not their intervals.
         learner.learn(10**9, StopTrainingOnMaxEpisodes(episodes))
         seconds = time.perf_counter() - start
@@ -320,16 +325,16 @@ def main():
     options = parser.parse_args()
     torch.set_num_threads(1)
     comparison = Comparison(options.system, options.folder, options.judged)
-    seeds, lines, learner = range(options.seeds), comparison.lines(), options.learner
+    seeds, longer = range(options.seeds), range(options.long_seeds)
+    lines, learner = comparison.lines(), options.learner
     rows = [("twinning", comparison.twinning, seeds, "twinning")]
     rows += [(comparison.system.classical, comparison.classical, [0], "classical")]
     rows += [("do-mpc, data sheet", comparison.data_sheet, [0], "do-mpc")]
     rows += [("do-mpc, coefficients of the twin", comparison.found, seeds, "do-mpc")]
     if comparison.system.true:
         rows += [("do-mpc, true coefficients", comparison.true, [0], "do-mpc")]
-    rows += [(learner, lambda seed: comparison.learned(seed, learner, 1), seeds, "learner")]
-    longer = f"{learner}, {LONG} times the episodes"
-    rows += [(longer, lambda seed: comparison.learned(seed, learner, LONG), range(options.long_seeds), "learner")]
+    for times, name, chosen in ((1, learner, seeds), (LONG, f"{learner}, {LONG} times the episodes", longer)):
+        rows += [(name, partial(comparison.beside, times=times, algorithm=learner), chosen, "learner")]
     print("| controller | seeds | J_a | Σ | real episodes | seconds | lines of code |")
     print("|---|---|---|---|---|---|---|")
     for name, measure, chosen, part in filter(operator.itemgetter(2), rows):
