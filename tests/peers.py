@@ -1,7 +1,7 @@
 """Controllers of others beside a recipe, on the same real system: ``uv run --group nightly tests/peers.py reactor``.
 
 The classical controller of the recipe, do-mpc with the coefficients of the data sheet and with those that the twin has
-found, and a learner of stable-baselines3 after as many real episodes and after fifty times as many fly the episodes
+found, and a learner of stable-baselines3 after as many real episodes and after ``--times`` as many fly the episodes
 that judge the recipe's live policy. The table has J_a of these, the costs of all real episodes before them, the
 seconds of the training, and the lines of code. The same command goes on where it was interrupted; another folder is
 another measurement.
@@ -35,8 +35,6 @@ from rt_torchrl.evaluation.unseen import RealEpisodes
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
-LONG = 50
-"""How many times as many real episodes a learner takes in its second row."""
 
 
 class System(NamedTuple):
@@ -318,7 +316,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system", choices=list(SYSTEMS))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--long-seeds", type=int, default=1, help="seeds of the learner with fifty times the episodes")
+    parser.add_argument("--long-seeds", type=int, default=1, help="seeds of the learner with more episodes")
+    parser.add_argument("--times", type=int, default=50, help="how many times as many episodes it takes there")
     parser.add_argument("--learner", default="SAC", choices=["SAC", "TD3"])
     parser.add_argument("--judged", type=int, default=20, help="episodes that judge")
     parser.add_argument("--folder", type=Path, default=Path("runs/peers"))
@@ -333,7 +332,10 @@ def main():
     rows += [("do-mpc, coefficients of the twin", comparison.found, seeds, "do-mpc")]
     if comparison.system.true:
         rows += [("do-mpc, true coefficients", comparison.true, [0], "do-mpc")]
-    for times, name, chosen in ((1, learner, seeds), (LONG, f"{learner}, {LONG} times the episodes", longer)):
+    for times, name, chosen in (
+        (1, learner, seeds),
+        (options.times, f"{learner}, {options.times} times the episodes", longer),
+    ):
         rows += [(name, partial(comparison.beside, times=times, algorithm=learner), chosen, "learner")]
     print("| controller | seeds | J_a | Σ | real episodes | seconds | lines of code |")
     print("|---|---|---|---|---|---|---|")

@@ -56,9 +56,9 @@ def test_the_reactor_is_held_better_than_by_its_controller(tmp_path):
 def test_the_drive_follows_its_reference_better_than_its_cascade(tmp_path):
     pytest.importorskip("gym_electric_motor", reason="the extra drive is not installed")
     summary, costs = trained("drive", tmp_path, "--episodes", "4")
-    assert costs[summary["live"]] < costs["cascade"]
+    assert costs[summary["live"]] < 0.95 * costs["cascade"]
     true = {"excitation": 1.7e-3, "inertia": 3e-3, "friction": 0.01, "fan": 1e-4}
-    assert summary["closure"]["found"] == pytest.approx(true, rel=1e-2)
+    assert summary["closure"]["found"] == pytest.approx(true, rel=1e-4)
 
 
 @pytest.mark.nightly
