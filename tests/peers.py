@@ -100,7 +100,7 @@ SYSTEMS = {
         "PI", reactor_rates, reactor_cost, 20, true=(7.2e10 / 60.0 * np.exp(-8750.0 / 325.0), 8750.0, 5e4 / 239e3 / 6.0)
     ),
     "drive": System("Cascade", drive_rates, drive_cost, 30, true=(1.7e-3, 3e-3, 0.01, 1e-4)),
-    "double_pendulum": System("LQR", double_pendulum_rates, double_pendulum_cost, 60, true=(500.0, 0.05, 0.05)),
+    "double_pendulum": System("LQR", double_pendulum_rates, double_pendulum_cost, 40),
 }
 
 
