@@ -1,4 +1,4 @@
-"""DDPG, TD3 and SAC of this library and of stable-baselines3: ``uv run --group nightly tests/learners.py --seeds 5``.
+"""DDPG, TD3 and SAC of this library and of stable-baselines3: ``uv run --group nightly tests/learners.py``.
 
 Both learn from the same number of real steps, on Gymnasium's pendulum and on the turbine, with as many updates after
 each episode and with the same batches, widths of networks, rates, discounts, rewards and noise. What differs is each

@@ -119,6 +119,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run --extra tank tests/ruler.py"}  # tests/test_results.py
     known |= {"uv run --group nightly tests/fast_gradients.py"}  # tests/test_benchmark.py
+    known |= {"uv run --group nightly tests/learners.py"}  # half an hour
     known |= {
         command
         for command in rest
