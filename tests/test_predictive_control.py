@@ -11,6 +11,7 @@ from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
 from test_optimal_control import least_squares
 
+from rt_torchrl import PlannerConfig, RunConfig, TwinningConfig
 from rt_torchrl.control.forecasts import Decaying, Held, Scattered
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -27,6 +28,29 @@ PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
 
 def control(plant=PLANT, closure=None, **options):
     return PredictiveControl(plant, closure or plant.closure, PredictiveConfig(horizon=1.0, **options))
+
+
+@pytest.mark.parametrize(
+    ("dt", "horizon", "hold", "expected"),
+    [
+        (0.05, 10.0, None, 1.0),
+        (10.0, 1200.0, None, 200.0),
+        (0.1, 2.0, None, 0.5),
+        (0.1, 5.0, 0.5, 1.0),
+        (1.0, 2.0, None, 1.0),
+    ],
+)
+def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode(dt, horizon, hold, expected):
+    assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
+
+
+def test_a_window_that_does_not_fit_is_refused_by_the_name_of_its_option():
+    planner = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=0.25))
+    config = RunConfig(twinning=TwinningConfig(planner=planner))
+    with pytest.raises(
+        ValueError, match=r"twinning\.planner\.receding_horizon: horizon=0.25 s must be a whole multiple"
+    ):
+        config.acting_policies({}, PLANT, PLANT.closure)
 
 
 def episodes(batch=2, seed=1):

@@ -16,7 +16,14 @@ from test_optimal_control import quadratic_program
 from rt_torchrl import load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
-from rt_torchrl.evaluation.limits import LimitConfig, exact_optimum, fitting, flown_starts, resting_at_the_end
+from rt_torchrl.evaluation.limits import (
+    LimitConfig,
+    exact_optimum,
+    fitting,
+    flown_starts,
+    predictive,
+    resting_at_the_end,
+)
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.options import configuration
 from rt_torchrl.runs.results import results_table
@@ -84,6 +91,28 @@ def test_impossible_options_are_refused(config, options, message):
 def test_a_window_is_no_longer_than_an_episode(horizon, expected):
     window = dataclasses.replace(WINDOW, horizon=8.0, hold=0.5, period=1.0)
     assert fitting(window, LinearQuadratic(horizon=horizon)).horizon == pytest.approx(expected)
+
+
+class Undisturbed(LinearQuadratic):
+    """The plant of the oracle without inputs."""
+
+    inputs = ()
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return super().vector_field(t, state, action, state.new_zeros((*state.shape[:-1], 1)), closure)
+
+    def draw_exogenous(self, batch, generator):
+        return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plant", [LinearQuadratic(dt=2.0, horizon=20.0), Undisturbed(horizon=2.0)])
+def test_model_predictive_control_that_nobody_set_suits_any_plant(plant):
+    """Two commands of an episode of ten are fewer than the futures of a scattered forecast; none is not forecast."""
+    unseen = UnseenEpisodes(plant, 2)
+    idle = Rollout(plant, plant.closure).costs(
+        unseen.initial_state, unseen.exogenous, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64)
+    )
+    assert predictive(unseen, PredictiveConfig()).mean < idle.mean()
 
 
 def test_the_tanks_limit_begins_from_valves_that_suit_its_command():

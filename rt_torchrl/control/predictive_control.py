@@ -37,7 +37,8 @@ class PredictiveConfig:
     """Parameters of model predictive control.
 
     Args:
-        horizon: length of the window over which a plan is made [s]; every plant needs its own.
+        horizon: length of the window over which a plan is made [s]; None for 20 held commands, or for a quarter of the
+            plant's episode where that is shorter.
         period: time between two plans [s]; None for ``hold``.
         hold: time for which a command is held [s]; None for the plant's control interval.
         iterations: greatest number of iterations of L-BFGS-B in a solve.
@@ -53,7 +54,7 @@ class PredictiveConfig:
         ValueError: if a number is out of its range.
     """
 
-    horizon: Positive = 1.0
+    horizon: Positive | None = None
     period: Positive | None = None
     hold: Positive | None = None
     iterations: AtLeastOne = 20
@@ -61,6 +62,13 @@ class PredictiveConfig:
     deadline: Limit = math.inf
     forecast: Literal["held", "decaying", "scattered"] = "decaying"
     virtual_episodes: AtLeastOne = 3
+
+    def length(self, plant: Plant) -> float:
+        """Length of the window of a plant [s]."""
+        if self.horizon is not None:
+            return self.horizon
+        hold = self.hold or plant.dt
+        return hold * max(1, min(20, math.floor(0.25 * plant.horizon / hold + 1e-9)))
 
 
 class SharedCommands:
@@ -156,10 +164,10 @@ class RecedingHorizon:
         self.plant, self.config = plant, config
         self.forecast: Forecast = forecast or Held()
         hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
-        self.horizon = self._whole("horizon", config.horizon, hold)
+        self.horizon = self._whole("horizon", config.length(plant), hold)
         self.period = hold if config.period is None else self._whole("period", config.period, hold)
         if self.period > self.horizon:
-            raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
+            raise ValueError(f"period={config.period} s must not be longer than horizon={config.length(plant)} s.")
         self.cost = CommandCost(plant, constant(closure), hold=hold, terminal=terminal)
         self._descent = BoundedDescentConfig(
             iterations=config.iterations, tolerance=config.tolerance, gradient=0.0, memory=PAIRS
@@ -345,7 +353,7 @@ class PredictiveControl(nn.Module):
         decaying = Decaying(torch.zeros_like(still), still, dt=plant.dt)
         if config.forecast == "decaying":
             return decaying
-        deviations = still.new_zeros(FUTURES, round(config.horizon / plant.dt), len(still))
+        deviations = still.new_zeros(FUTURES, round(config.length(plant) / plant.dt), len(still))
         return Scattered(decaying, deviations, -still, still.clone())
 
     def learn(self, records: Inputs) -> None:

@@ -154,7 +154,7 @@ def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
             f"horizon={plant.horizon:g} s of plant {plant.name!r} is shorter than the {unit:g} s between two plans of "
             "model predictive control; take longer episodes."
         )
-    return dataclasses.replace(window, horizon=min(window.horizon, longest))
+    return dataclasses.replace(window, horizon=min(window.length(plant), longest))
 
 
 def receding(
@@ -180,11 +180,17 @@ def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
 
 
 def forecasts(plant: Plant, exogenous: Inputs, window: PredictiveConfig) -> dict[str, Forecast]:
-    """The forecasts that are compared: held, decaying to the mean as other episodes do, with its scatter, and known."""
+    """The forecasts that are compared: held, decaying to the mean as other episodes do, with its scatter, and known.
+
+    A plant without inputs has nothing to forecast; all of them are one there.
+    """
+    if not plant.inputs:
+        return dict.fromkeys(("held", "decaying", "scattered", "preview"), Held())
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
-    over = {"dt": plant.dt, "horizon": min(window.horizon, 0.5 * plant.horizon)}
+    over = {"dt": plant.dt, "horizon": min(window.length(plant), 0.5 * plant.horizon)}
     decaying = Decaying.fitted(records, **over)
-    scattered = Scattered.fitted(decaying, records, **over, pairs=FUTURES)
+    directions = round(over["horizon"] / plant.dt) * len(plant.inputs)
+    scattered = Scattered.fitted(decaying, records, **over, pairs=min(FUTURES, directions))
     return {"held": Held(), "decaying": decaying, "scattered": scattered, "preview": Foreseen(exogenous, dt=plant.dt)}
 
 

@@ -274,7 +274,10 @@ class RunConfig:
         planner = self.twinning.planner
         if planner.method != "receding_horizon":
             return policies
-        return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
+        try:
+            return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
+        except ValueError as error:
+            raise ValueError(f"twinning.planner.receding_horizon: {error}") from error
 
     def limit(self) -> LimitConfig | None:
         """How the limit of the cost and model predictive control beside it are computed; None leaves them out.
