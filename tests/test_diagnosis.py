@@ -94,12 +94,13 @@ def rewrite(run, change):
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
 
 
-def test_a_run_that_ended_well_has_no_reason_but_that_it_acts_more(run):
+def test_a_run_that_ended_well_has_no_reason_and_the_user_judges_that_it_acts_more(run):
     reasons = diagnose(run)
     # Ten episodes from random initial states scatter too much to compare them with those of the plan.
-    assert [reason.holds for reason in reasons] == [False, False, False, None, True]
+    assert [reason.holds for reason in reasons] == [False, False, False, None, None]
     assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
-    assert "mean force [N]" in reasons[COST].evidence and "against 0 of still" in reasons[COST].evidence
+    evidence = reasons[COST].evidence
+    assert "judge whether it is better: mean force [N]" in evidence and "against 0 of still" in evidence
 
 
 def test_a_policy_above_the_least_cost_of_its_class_is_in_a_poor_minimum(run):

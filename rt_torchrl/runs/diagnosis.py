@@ -127,7 +127,10 @@ def _inputs(run: LoadedRun, costs: Costs) -> Reason:
 
 
 def _merits(run: LoadedRun) -> Reason:
-    """Whether the policy is cheaper than a classical controller, and yet another one in what users look at."""
+    """Whether the policy is cheaper than a classical controller, and yet another one in what users look at.
+
+    A plant does not say whether more of a quantity is better, so that the user has to judge.
+    """
     name, remedy = "the cost is not what was meant", "weights of the cost (docs/observations_and_costs.md)"
     unseen: dict[str, Any] = run.metrics["summary"].get("unseen", {})
     live, others = run.live, unseen.get("baselines", {})
@@ -142,5 +145,6 @@ def _merits(run: LoadedRun) -> Reason:
             mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
             if None not in (mean, its_mean) and abs(mean - its_mean) > MERIT * abs(its_mean):
                 apart.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
-    evidence = "; ".join(apart) if apart else "it is cheaper than no classical controller, or alike in every merit"
-    return Reason(name, bool(apart), evidence, remedy)
+    if apart:
+        return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(apart)}", remedy)
+    return Reason(name, False, "it is cheaper than no classical controller, or alike in every merit", remedy)
