@@ -10,6 +10,7 @@ import sys
 
 import pytest
 import torch
+from figure_reading import draw
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
 from test_classical import PD
@@ -379,8 +380,17 @@ def test_figures_show_the_episode_that_is_given(run):
     flown = run.simulate(run.policy("model_based"), torch.full((30, 1), 12.5), seed=5)
     ax = run.figure("states", flown).axes[0]
     drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
-    assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy())
+    assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy()) and "twin" in drawn
+    assert any(word.startswith("Real and twin states, one flight") for word in draw(run.figure("states", flown)))
     assert {"states", "actions", "learning_curves", "power_and_speed"} <= set(run.figure_names())
+
+
+def test_figures_call_a_flight_on_the_twin_so(run):
+    flown = run.simulate(run.policy("model_based"), torch.full((2, 30, 1), 12.5), on="twin")
+    for name, title in {"states": "States", "actions": "Applied actions", "power_and_speed": "Power and speed"}.items():
+        found = draw(run.figure(name, flown))
+        assert f"{title}, flight on the twin" in found and "real" not in found
+    assert not any(word.startswith("RMS") for word in draw(run.figure("states", flown)))
 
 
 def test_the_table_has_a_row_for_each_episode(run):

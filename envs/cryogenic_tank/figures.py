@@ -55,22 +55,23 @@ def tank(snapshot: Snapshot) -> Figure:
     twin = _quantities(plant, snapshot.replay, record.actions, snapshot.closure)
     group = -(-len(record.actions) // POINTS)
     note = f"\nmean and range of every {group * plant.dt / 60.0:g} min" if group > 1 else ""
-    title = f"Tank, episode {style.last_episode(snapshot)}{note}"
+    title = f"Tank, {style.episode(snapshot)}{note}"
     figure, axes, time = style.timeline(plant, len(record.actions), len(real) + 1, title=title, size=(9.5, 12.0))
     time, (*of_tank, load) = time[:-1], axes
     target, half = 1e-3 * plant.set_point, 1e-3 * BAND
     band: dict[str, Any] = {"color": style.REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
     axes[0].axhspan(target - half, target + half, **band)
     axes[0].axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
+    drawn: dict[str, Any] = {"linewidth": 1.5, "label": "_range", "record": style.record_label(snapshot)}
     for ax, (name, values) in zip(of_tank, real.items(), strict=True):
-        style.draw_groups(ax, time, array(values), group, linewidth=1.5, label="_range")
+        style.draw_groups(ax, time, array(values), group, **drawn)
         low, high = ax.get_ylim()
         middle, mean = style.means_of_groups(group, time, array(twin[name]))
         ax.plot(middle, mean, color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         height = high - low
         ax.set_ylim(max(min(low, mean.min()), low - height), min(max(high, mean.max()), high + height))
         caption(ax, name)
-    style.draw_groups(load, time, array(record.exogenous[:, 0]), group, linewidth=1.5, label="_range")
+    style.draw_groups(load, time, array(record.exogenous[:, 0]), group, **drawn)
     if snapshot.large_scale is not None:
         mean = array(snapshot.large_scale[:, 0])
         look: dict[str, Any] = {"color": style.LARGE_SCALE, "linewidth": 1.0, "label": "large scale (SVR)"}
@@ -150,7 +151,7 @@ def coefficients(snapshot: Snapshot) -> Figure:
         ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
         ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
     )
-    title = f"Coefficients, episode {style.last_episode(snapshot)}\nother features at their mean in the episode"
+    title = f"Coefficients, {style.episode(snapshot)}\nother features at their mean in the episode"
     figure, axes = style.panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
     for column, (label, unit) in enumerate(axes_of):
         low, high = seen[:, column].min(), seen[:, column].max()

@@ -36,7 +36,7 @@ def flight_path(snapshot: Snapshot) -> Figure:
 
     The axes span the real flight and the target; a twin that flies elsewhere leaves them.
     """
-    title = f"Flight path, episode {style.last_episode(snapshot)}"
+    title = f"Flight path, {style.episode(snapshot)}"
     figure, axes = style.panels(2, 2, title=title, size=(11.0, 5.8), width_ratios=(1.35, 1.0))
     (path, wind), (below, distance) = axes
     below.remove()
@@ -52,7 +52,7 @@ def flight_path(snapshot: Snapshot) -> Figure:
 def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     wind = array(snapshot.record.exogenous)[:, 0]
-    ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label="real")
+    ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label=style.record_label(snapshot))
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
     ax.plot(*array(plant.target), "*", color=style.REFERENCE, markersize=15, label="target")
     # The line is added instead of plotted, so that the axes do not grow to hold it.
@@ -106,7 +106,7 @@ def _draw_distance(ax: Axes, snapshot: Snapshot) -> None:
         for states in (snapshot.record.states, snapshot.replay)
     )
     time, label = style.time_axis(plant, len(real) - 1)
-    ax.plot(time, real, color=REAL, linewidth=1.9, label="real")
+    ax.plot(time, real, color=REAL, linewidth=1.9, label=style.record_label(snapshot))
     ax.plot(time, twin, color=TWIN, linewidth=1.0, label=style.twin_label(snapshot))
     ax.set_yscale("log")
     style.plain_numbers(ax)
@@ -124,11 +124,15 @@ def flight(snapshot: Snapshot) -> Figure:
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     applied = array(snapshot.record.actions)
     beat = round(1.0 / (plant.frequency * plant.dt))
-    of_beats: dict[str, Any] = {"linewidth": 1.9, "label": "range within each beat"}
-    title = f"Flight, episode {style.last_episode(snapshot)}\nspeeds and actions: mean over each wing beat"
+    of_beats: dict[str, Any] = {
+        "linewidth": 1.9,
+        "label": "range within each beat",
+        "record": style.record_label(snapshot),
+    }
+    title = f"Flight, {style.episode(snapshot)}\nspeeds and actions: mean over each wing beat"
     figure, axes, time = style.timeline(plant, len(applied), 6, 2, title=title, size=(11.0, 7.4))
     for k, ax in enumerate(axes[:2]):
-        ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label="real")
+        ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label=style.record_label(snapshot))
         ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         ax.axhline(plant.target[k].item(), label="target", **REFERENCE_LINE)
         caption(ax, plant.states[k].label)

@@ -37,7 +37,7 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state = record.states[:-1]
     omega_g = plant.gear_ratio * state[:, 0]
-    title = f"Power and speed, episode {style.last_episode(snapshot)}"
+    title = f"Power and speed, {style.episode(snapshot)}"
     figure, axes, time = style.timeline(plant, len(state), 5, title=title, size=(8.5, 9.5))
     wind, speed, power, torque, pitch = axes
 
@@ -47,10 +47,10 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 
     draw(wind, record.exogenous[:, 0], "wind", linewidth=0.9)
     draw(wind, state[:, 2], "filtered", color=FILTERED, linewidth=2.0)
-    draw(speed, omega_g, "real")
+    draw(speed, omega_g, style.record_label(snapshot))
     draw(speed, state[:, 1], "filtered", color=FILTERED, linewidth=2.0)
     draw(speed, plant.reference_speed(state[:, 2]), r"reference $\tilde\omega_g$", **REFERENCE_LINE)
-    draw(power, 1e-6 * plant.generator_power(state, record.actions), "real")
+    draw(power, 1e-6 * plant.generator_power(state, record.actions), style.record_label(snapshot))
     draw(power, 1e-6 * plant.reference_power(omega_g), r"reference $\tilde P$", **REFERENCE_LINE)
     draw(torque, 1e-3 * record.actions[:, 0], "applied", drawstyle="steps-post")
     draw(pitch, record.actions[:, 1], "applied", drawstyle="steps-post")

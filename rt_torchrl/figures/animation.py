@@ -53,7 +53,7 @@ class Scene:
         time, label = style.time_axis(snapshot.plant, self.intervals)
         self._draw, self._time, self._unit = draw, time, label.removeprefix("time [").removesuffix("]")
         self._decimals = max(0, 2 - int(np.log10(time[-1])))
-        named, shape = f"{title}, episode {style.last_episode(snapshot)}", (len(shown) or 1, len(width_ratios))
+        named, shape = f"{title}, {style.episode(snapshot)}", (len(shown) or 1, len(width_ratios))
         self.figure, axes = style.panels(*shape, title=named, size=size, width_ratios=width_ratios)
         for ax in axes[1:, 0]:
             ax.remove()

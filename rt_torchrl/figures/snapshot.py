@@ -33,6 +33,8 @@ class Snapshot:
             is a part of an episode.
         realisations: samples of the exogenous process of the record; None as ``large_scale``.
         episodes: entries of the episodes, as in ``metrics.json``.
+        simulated: words of a title for a record that is no episode of the training; empty for one that is.
+        on_the_twin: whether the twin has flown the record.
     """
 
     plant: Plant
@@ -47,6 +49,8 @@ class Snapshot:
     large_scale: Float[Tensor, "n n_acting"] | None
     realisations: Float[Tensor, "k n n_acting"] | None
     episodes: list[dict[str, Any]]
+    simulated: str = ""
+    on_the_twin: bool = False
 
     @classmethod
     @torch.no_grad()

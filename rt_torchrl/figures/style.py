@@ -191,13 +191,15 @@ def means_of_groups(group: int, *series: np.ndarray) -> list[np.ndarray]:
     return [np.add.reduceat(values, starts) / counts for values in series]
 
 
-def draw_groups(ax: Axes, time: np.ndarray, values: np.ndarray, group: int, *, linewidth: float, label: str) -> None:
-    """Draw the real record in groups of samples: the mean of each, and its range, which ``label`` names."""
+def draw_groups(
+    ax: Axes, time: np.ndarray, values: np.ndarray, group: int, *, linewidth: float, label: str, record: str
+) -> None:
+    """Draw the record in groups of samples: the mean of each, which ``record`` names, and its range, ``label``."""
     starts, (middle, mean) = np.arange(0, len(values), group), means_of_groups(group, time, values)
     if group > 1:
         least, greatest = (extreme.reduceat(values, starts) for extreme in (np.minimum, np.maximum))
         ax.fill_between(middle, least, greatest, color=SAMPLES, alpha=0.45, linewidth=0, label=label)
-    ax.plot(middle, mean, color=REAL, linewidth=linewidth, label="real")
+    ax.plot(middle, mean, color=REAL, linewidth=linewidth, label=record)
 
 
 def closure_look(name: str) -> dict[str, Any]:
@@ -234,8 +236,18 @@ def closures(snapshot: Snapshot) -> dict[str, nn.Module]:
 
 
 def last_episode(snapshot: Snapshot) -> int:
-    """Number of the record's episode, from 0 as in ``metrics.json``."""
+    """Number of the training's last episode, from 0 as in ``metrics.json``."""
     return max(len(snapshot.episodes) - 1, 0)
+
+
+def episode(snapshot: Snapshot) -> str:
+    """What a title calls the record."""
+    return snapshot.simulated or f"episode {last_episode(snapshot)}"
+
+
+def record_label(snapshot: Snapshot) -> str:
+    """Label of the record's line."""
+    return "twin, in flight" if snapshot.on_the_twin else "real"
 
 
 def twin_label(snapshot: Snapshot) -> str:

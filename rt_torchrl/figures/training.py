@@ -64,20 +64,27 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 
 
 def states(snapshot: Snapshot) -> Figure:
-    """Every state over time, as measured and as the twin replays it with the same actions, and the RMS difference."""
+    """Every state over time, as measured and as the twin replays it with the same actions, and the RMS difference.
+
+    A flight on the twin, which no system has measured, has no replay.
+    """
     signals, real, twin = snapshot.plant.states, array(snapshot.record.states), array(snapshot.replay)
     columns = 1 if len(signals) <= 3 else 2
-    anew = f", replayed in segments of {snapshot.segment} intervals" if snapshot.segment else ""
+    replayed = snapshot.segment and not snapshot.on_the_twin
+    anew = f", replayed in segments of {snapshot.segment} intervals" if replayed else ""
     figure, axes, time = style.timeline(
         snapshot.plant,
         len(real) - 1,
         len(signals),
         columns,
-        title=f"Real and twin states, episode {style.last_episode(snapshot)}{anew}",
+        title=f"{'States' if snapshot.on_the_twin else 'Real and twin states'}, {style.episode(snapshot)}{anew}",
         size=(7.5 + 3.5 * (columns - 1), 1.0 + 1.9 * -(-len(signals) // columns)),
     )
     for k, (ax, signal) in enumerate(zip(axes, signals, strict=True)):
-        ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label="real")
+        ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label=style.record_label(snapshot))
+        if snapshot.on_the_twin:  # its replay is the same curve
+            caption(ax, signal.label)
+            continue
         ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         rms = np.sqrt(np.mean((twin[:, k] - real[:, k]) ** 2))
         rms = 0.0 if rms <= 1e-10 * np.abs(real[:, k]).max() else rms
@@ -91,7 +98,7 @@ def actions(snapshot: Snapshot) -> Figure:
     signals, applied = snapshot.plant.actions, array(snapshot.record.actions)
     # Who acted in the record; the snapshot's live policy may have changed since then.
     actor = (snapshot.episodes[-1].get("live") if snapshot.episodes else None) or snapshot.live
-    title, size = f"Applied actions, episode {style.last_episode(snapshot)}", (7.5, 1.2 + 2.0 * len(signals))
+    title, size = f"Applied actions, {style.episode(snapshot)}", (7.5, 1.2 + 2.0 * len(signals))
     figure, axes, time = style.timeline(snapshot.plant, len(applied), len(signals), title=title, size=size)
     look: dict[str, Any] = {"color": ROLES[actor], "linewidth": 1.3, "label": f"{role_name(actor)}, live"}
     for k, (ax, signal) in enumerate(zip(axes, signals, strict=True)):
@@ -114,7 +121,7 @@ def exogenous(snapshot: Snapshot) -> Figure:
         len(recorded),
         rows * columns,
         columns,
-        title=f"Exogenous input, episode {style.last_episode(snapshot)}",
+        title=f"Exogenous input, {style.episode(snapshot)}",
         size=(max(7.5, 5.0 * columns), 0.9 + 2.4 * rows),
         sharey="col",
     )

@@ -24,7 +24,7 @@ from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, TwinFlight
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:
@@ -75,6 +75,11 @@ class LoadedRun:
         role: Role = self.metrics["summary"]["live"]
         return role
 
+    @property
+    def _only_on_the_twin(self) -> bool:
+        """Whether nobody knows the true closure of the real system."""
+        return self.metrics["summary"].get("unseen", {}).get("judged_on") == "twin"
+
     def table(self) -> "pandas.DataFrame":
         """The episodes as a table: a row for each, a column for each entry; nested entries are ``seconds.plan``.
 
@@ -119,10 +124,10 @@ class LoadedRun:
             raise ValueError(f"on={on!r} must be real or twin.")
         if not isinstance(policy, nn.Module | StateFeedback):
             raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
-        if on == "real" and self.metrics["summary"].get("unseen", {}).get("judged_on") == "twin":
+        if on == "real" and self._only_on_the_twin:
             raise ValueError(
                 "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
-                "on='twin', and to a figure the episode: run.figure(name, run.simulate(policy, on='twin'))."
+                "on='twin'."
             )
         believed = self.twin.believed
         plant, closure = (self.plant, self.true_closure()) if on == "real" else (believed.plant, believed.closure)
@@ -138,6 +143,7 @@ class LoadedRun:
             flown = policy.fly(start, inputs, closure, plant=plant)
         else:
             flown = Rollout(plant, closure, policy)(start, inputs)
+        flown = TwinFlight(*flown) if on == "twin" else flown
         return flown.each()[0] if single else flown
 
     def figure(self, name: str, flown: Trajectory | None = None) -> "Figure":
@@ -146,7 +152,7 @@ class LoadedRun:
         Args:
             name: name of the figure, such as states, actions, learning_curves or power_and_speed.
             flown: episode that figures of an episode show, from :meth:`simulate`; None for an episode that no training
-                has seen, under the live policy and without exploration.
+                has seen, under the live policy and without exploration, on the twin where nobody knows the real system.
 
         Raises:
             ValueError: if this run has no such figure.
@@ -186,14 +192,19 @@ class LoadedRun:
         snapshot = self._snapshot(flown)
         recipe: Any = sys.modules.get(type(self.config).__module__)
         own = getattr(recipe, "plant_figures", None)
-        drawn = {"flights": figures.flights(self.physics, {self.live: snapshot.record})} | figures.figures_of(snapshot)
+        where = "on the twin" if snapshot.on_the_twin else ""
+        flights = figures.flights(self.physics, {self.live: snapshot.record}, where=where)
+        drawn = {"flights": flights} | figures.figures_of(snapshot)
         return drawn | (own(snapshot) if own else {})
 
     @torch.no_grad()
     def _snapshot(self, flown: Trajectory | None) -> Snapshot:
         """The state of a finished run, with an episode as the record: by default the first unseen one."""
         live = self.live
-        record = self.simulate(self.policy(live), seed=UNSEEN_SEED) if flown is None else flown
+        if flown is None:
+            place = "twin" if self._only_on_the_twin else "real"
+            flown = self.simulate(self.policy(live), seed=UNSEEN_SEED, on=place)
+        on_the_twin, record = isinstance(flown, TwinFlight), flown
         record = record if record.states.dim() == 2 else record.each()[0]
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
         segment = self.metrics["summary"].get("twin", {}).get("segment", 0)
@@ -218,6 +229,8 @@ class LoadedRun:
             large_scale=None if process is None else process.mean,
             realisations=None if process is None else process.sample(5, torch.Generator().manual_seed(0)),
             episodes=self.metrics["episodes"],
+            simulated="flight on the twin" if on_the_twin else "one flight",
+            on_the_twin=on_the_twin,
         )
 
 

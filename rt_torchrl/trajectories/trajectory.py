@@ -38,7 +38,7 @@ class Trajectory(NamedTuple):
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
         """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
         states, actions, exogenous, start, seen = self
-        return Trajectory(
+        return type(self)(
             change(states),
             change(actions),
             change(exogenous),
@@ -91,6 +91,10 @@ class Trajectory(NamedTuple):
         """The trajectories of a batch, one by one."""
         starts = torch.as_tensor(self.start, dtype=torch.float64, device="cpu").expand(len(self.states)).tolist()
         return [self.rows(k)._replace(start=start) for k, start in enumerate(starts)]
+
+
+class TwinFlight(Trajectory):
+    """A trajectory that a twin has flown, which figures do not call real."""
 
 
 def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
