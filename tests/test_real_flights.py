@@ -6,6 +6,7 @@ import signal
 
 import pytest
 import torch
+from figure_reading import draw
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 from test_algorithm import flown, twinning
@@ -107,6 +108,8 @@ def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
     with pytest.raises(ValueError, match="nobody knows the true closure of this run's real system"):
         finished.simulate(finished.policy("model_based"))
     assert finished.simulate(finished.policy("model_based"), on="twin").states.isfinite().all()
+    assert {"states", "actions", "flights"} <= set(finished.figure_names())
+    assert "States, flight on the twin" in draw(finished.figure("states"))
 
 
 class Asked(RealController):
@@ -129,6 +132,7 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     live = summary["live"]
     words = live.replace("_", "-")
     assert f"6 flights on the real system: 2 of the live policy ({words}), 2 of cascade, 2 of PD" in said
+    assert "J_a on the real system, 2 other episodes of PD: " in said
     paid = summary["cost_of_learning"]
     assert paid["episodes"] == 9 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)

@@ -52,7 +52,7 @@ def test_a_run_states_the_limit_beside_the_optimum_of_its_class(tmp_path, config
     if config is RunConfig:
         assert set(found) == {"J_a", "J_a_by_gradients", "J_a_of_each_start", "better_over_reference"}
         assert found["J_a"] <= found["J_a_by_gradients"]
-        assert "limit on" not in results_table(metrics)
+        assert "no limit: the recipe's Config has no limit()" in results_table(metrics)
         return
     best, unseen = found["limit"], UnseenEpisodes(plant, 4)
     exact = [

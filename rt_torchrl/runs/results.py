@@ -296,9 +296,8 @@ def entry(contender: Contender) -> dict[str, Any]:
     return {"merit": contender.merit, **contender.details}
 
 
-SCREEN = 24
-"""Lines of a terminal that need no scrolling."""
-LEAST_WEIGHTS = 4
+MOST_WEIGHTS = 12
+"""Number of weights of the closure in the table."""
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
@@ -359,7 +358,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         lines += limit_lines(found["reference"])
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
-        lines.append(f"  {f'J_a {name}{twin}':<22}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
+        lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
     lines += merit_lines(unseen)
     lines += real_lines(found.get("real_unseen"), found.get("twin", {}).get("segment", 0))
     paid = found["cost_of_learning"]
@@ -372,9 +371,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(found.get("twin"))
-    room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
     errors = found.get("twin", {}).get("standard_errors", {})
-    lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room), errors=errors)
+    lines += closure_lines(found["closure"], most=MOST_WEIGHTS, errors=errors)
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
 
@@ -390,15 +388,17 @@ def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
         lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
     for name, one in found["controllers"].items():
         mean, who = _number(one["J_a"]["mean"], ".5g"), name.replace("_", "-")
-        lines.append(f"  J_a on the real system, {one['episodes']} flights of {who}: {mean} {_interval(one['J_a'])}")
+        lines.append(
+            f"  J_a on the real system, {one['episodes']} other episodes of {who}: {mean} {_interval(one['J_a'])}"
+        )
         lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
     return lines
 
 
 def limit_lines(reference: dict[str, Any]) -> list[str]:
-    """Lines with the limit and what costs how much over it, if it was computed."""
+    """Lines with the limit and what costs how much over it, or why it was not computed."""
     if "limit" not in reference:
-        return []
+        return ["  no limit: the recipe's Config has no limit(), or limit_episodes is 0"]
     best = reference["limit"]
     shares = [
         (name, best[key]) for name, key in (("better policy", "better_over_limit"), ("optimum", "optimum_over_limit"))
