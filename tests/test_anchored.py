@@ -17,7 +17,7 @@ from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.plant import Transition
 from rt_torchrl.plants.sensors import UnreadInput
-from rt_torchrl.steps.belief import ANCHORS, HISTORY, LENGTH, NOISE, Belief
+from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
 from rt_torchrl.steps.config import ConstraintsConfig, ExogenousConfig
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -190,7 +190,7 @@ def test_a_twin_that_has_been_right_keeps_the_word():
 
 def test_corrections_are_averaged_and_those_of_like_policies_count_once():
     real, physics = pushed()
-    belief, policy = belief_of(real, physics, [(0.5, 0.5), (1.5, 0.4), (1.51, 0.4)]), LinearGain([[1.0, 0.5]])
+    belief, policy = belief_of(real, physics, [(0.5, 0.5), (1.5, 0.4), (1.5, 0.4)]), LinearGain([[1.0, 0.5]])
     anchors = belief.anchors()
     points = torch.cat([anchors.replays.actions(policy)[None], anchors.replays.flown]).detach().numpy()
     c = anchors.replays.corrections(policy).detach().numpy()
@@ -395,24 +395,6 @@ def test_the_latest_whole_episodes_are_replayed_and_again_where_the_twin_has_cha
     with torch.no_grad():
         belief.virtual.twin.closure.matrix[0, 0] += 1e-3
     assert belief.anchors() is not anchors
-
-
-def test_an_early_flight_over_a_cliff_is_not_forgotten_over_many_calm_ones():
-    """Policies like each other say nothing of the cliff, however often they fly."""
-    real, physics = pushed(horizon=2.0)
-    calm = [(0.5 + 0.01 * (k % 3), 0.5) for k in range(HISTORY + 5)]
-    beliefs = [belief_of(real, physics, calm[:3])]
-    for gains in ([], calm[3:]):
-        belief = belief_of(real, physics, calm[:3])
-        cliff = belief.flown[0]._replace(weights={"gain": torch.tensor([[0.9, 0.5]]).double()})
-        belief.append(cliff.trajectory, "model_based", 20.0 * cliff.cost, weights=cliff.weights)
-        for seed, gain in enumerate(gains, start=3):
-            (record,), _, cost = flown_on(real, LinearGain([gain]), physics, seed=seed, count=1)
-            belief.append(record, "model_based", cost.item(), weights=LinearGain([gain]).state_dict())
-        beliefs.append(belief)
-    never, soon, late = (belief.anchors() for belief in beliefs)
-    assert len(beliefs[2].flown) == HISTORY and len(late.replays.read) == len(soon.replays.read) == 4
-    assert soon.growth > 10.0 * never.growth and late.growth == pytest.approx(soon.growth, rel=0.5)
 
 
 def test_plans_on_expected_costs_find_what_the_twin_alone_does_not():

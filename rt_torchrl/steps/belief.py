@@ -1,8 +1,8 @@
 r"""What a policy costs on the real system: a belief over policies, learned from the real episodes.
 
-The twin flies the last real episode of each policy again under another one, alone and with what it did not explain of
-the episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin
-says, the better the nearer the policy is to the one that flew: its error has the variance
+The twin flies each of the latest real episodes again under the policy, alone and with what it did not explain of the
+episode (:mod:`~rt_torchrl.trajectories.anchored`). The log of the ratio, :math:`c_i(\pi)`, corrects what the twin says,
+the better the nearer the policy is to the one that flew: its error has the variance
 
 .. math:: s_i^2 = \sigma^2 + n_iv\,\|\pi - \pi_i\|^2, \qquad n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
 
@@ -45,9 +45,9 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, c
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 HISTORY = 20
-"""Number of real episodes that are kept; the oldest goes whose policy has flown again, or else the oldest."""
+"""Number of latest real episodes that are kept."""
 ANCHORS = 8
-"""Number of latest policies whose anchored replays plans descend on; policies are judged by those of all."""
+"""Number of latest whole episodes whose anchored replays plans descend on; policies are judged by those of all."""
 NOISE = 0.05
 """Least standard deviation σ of the correction by an episode that was flown with the policy, and what is expected."""
 LENGTH = 0.1
@@ -75,10 +75,6 @@ class Flown(NamedTuple):
     cost: float
     exploration: float = 0.0
 
-    def flew_in(self, others: "Sequence[Flown]") -> bool:
-        """Whether the weights flew other episodes, too."""
-        return any(equal(self.weights, other.weights) for other in others)
-
 
 class Judged(NamedTuple):
     """What a policy costs; the smaller one is the better one.
@@ -93,7 +89,7 @@ class Judged(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The anchored replays of each policy's last episode, the variance σ² of their corrections, and its growth v."""
+    """The anchored replays of the latest real episodes, and the variance σ² of their corrections with its growth v."""
 
     replays: AnchoredReplays
     noise: float
@@ -140,10 +136,7 @@ class Belief:
             )
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
-        self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)]
-        if len(self.flown) > HISTORY:
-            again = (k for k, one in enumerate(self.flown) if one.flew_in(self.flown[k + 1 :]))
-            del self.flown[next(again, 0)]
+        self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
         self._costs = self._anchored = None
 
     def policy_of(self, flown: Flown) -> nn.Module:
@@ -245,7 +238,7 @@ class Belief:
 
         Args:
             policy: the policy.
-            latest: number of latest policies whose episodes it comes from.
+            latest: number of latest whole episodes that it comes from.
 
         Raises:
             DivergenceError: if a replay diverges under the policy.
@@ -266,7 +259,7 @@ class Belief:
         return any(beyond(d, flown.exploration) > NOISE for d, flown in pairs if not math.isnan(d))
 
     def anchors(self) -> "Anchors | None":
-        """The last whole episode of each policy that the present twin flies; None without any, or if it is right."""
+        """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
         twin = self.virtual.twin
         state = twin.state_dict()
         if self._anchored is None or not equal(state, self._anchored[0]):
@@ -278,16 +271,14 @@ class Belief:
         if not self.contradicted:
             return None
         whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
-        pairs = list(zip(self.flown, self._predicted(), self.differences(), strict=True))
-        for flown, predicted, d in reversed(pairs):
+        for flown, predicted, d in zip(self.flown, self._predicted(), self.differences(), strict=True):
             met = self.virtual.repeated(flown.trajectory).exogenous
             # State feedback is no function of an observation, a part of an episode has another cost, and where the
             # twin diverges, or nearly does, nothing is near.
-            near = met.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER
-            if near and not flown.flew_in(whole):
-                whole.insert(0, flown)
-                inputs.insert(0, met)
-                differences.insert(0, d)
+            if met.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER:
+                whole.append(flown)
+                inputs.append(met)
+                differences.append(d)
         if not whole:
             return None
         made = self._twins.get(twin)
@@ -301,7 +292,7 @@ class Belief:
             torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),
             lambda k: self.policy_of(whole[k]),
         )
-        return Anchors(replays, *self._variances(replays, whole, differences))
+        return Anchors(replays, *self._variances(replays.latest(ANCHORS), whole[-ANCHORS:], differences[-ANCHORS:]))
 
     def _variances(
         self, replays: AnchoredReplays, flown: Sequence[Flown], differences: Sequence[float]
