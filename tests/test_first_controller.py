@@ -8,6 +8,7 @@ from test_algorithm import twinning
 from test_classical import PD, episodes
 
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig
+from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.start import FirstController
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
@@ -20,7 +21,7 @@ def begun(*, gains=GAINS, **options):
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
     parts = {"planner": PlannerConfig(iterations=0), "assimilation": AssimilationConfig(iterations=3)}
     counts = {"realisations": 4, "virtual_episodes": 4}
-    return twinning(seed=3, first=first, learner=learner, **counts, **parts, **options)
+    return twinning(seed=3, first=first, learner=learner, **counts, **parts | options)
 
 
 def test_it_acts_as_it_flies():
@@ -70,6 +71,17 @@ def test_a_harmful_controller_is_not_imitated():
     before = found.policies["model_based"].gain.detach().clone()
     assert "does not imitate the controller" in found.start()["reason"]
     assert torch.equal(before, found.policies["model_based"].gain)
+
+
+def test_a_policy_that_cannot_imitate_is_planned_before_it_flies(monkeypatch):
+    monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
+    found = begun(planner=PlannerConfig(iterations=20))
+    with torch.no_grad():
+        for policy in found.policies.values():
+            policy.gain.fill_(-1.0)
+    report = found.start()
+    assert report["start_cost_ratio_model_free"] > 2.0 and report["plan_accepted"] == 1.0
+    assert report["J_a_plan"] < 0.6 * report["J_a_plan_before"] and (found.model_based.gain > 0.0).all()
 
 
 def run(folder, **options):

@@ -351,7 +351,7 @@ class Belief:
         Raises:
             DivergenceError: if it does.
         """
-        if not math.isfinite(self.virtual.cost(self.policy_of(self.flown[-1]), episodes)):
+        if self.flown and not math.isfinite(self.virtual.cost(self.policy_of(self.flown[-1]), episodes)):
             twin = self.virtual.twin
             raise DivergenceError(
                 f"plant {twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "

@@ -38,7 +38,8 @@ SAMPLES = 5000
 BLOWN_UP = 1e3
 """Observation, which is of order one in a sound flight, beyond which a twin has blown up."""
 TWICE = 2.0
-"""Cost of an imitation with extreme episodes over the controller's, from which it also learns from these."""
+"""Cost over the controller's from which an imitation does not do: with extreme episodes it learns from these, too, and
+what is left of it is planned before it flies."""
 
 
 class Imitation:
@@ -138,7 +139,7 @@ class Imitation:
                 policy.load_state_dict(before)
                 error = self.imitate(teacher, policy, seen=records, draw=lambda: self.virtual.with_extremes(draw()))
         cost = self.virtual.judge(policy, judged_on)
-        found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost[1] / wanted}
+        found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": min(cost, start)[1] / wanted}
         if cost <= start:
             return findings(**found)
         policy.load_state_dict(before)
