@@ -164,6 +164,12 @@ def test_what_a_run_does_not_say_is_no_reason(run):
     assert [reasons[k].holds for k in (TWIN, INPUTS, COST)] == [None, None, None]
 
 
+def test_episodes_that_may_end_early_leave_the_class_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(LinearQuadratic, "end_cost", 1.0)
+    reason = diagnose(finished(tmp_path))[CLASS]
+    assert reason.holds is None and "may end early" in reason.evidence
+
+
 def test_predictive_control_has_no_weights_in_a_minimum(tmp_path):
     planner = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=3.0))
     reasons = diagnose(finished(tmp_path, twinning=TwinningConfig(arm="model_based", planner=planner)), episodes=2)

@@ -102,6 +102,8 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, best: Costs) -> Reason:
     """Whether a controller that plans at every step is better on the twin than the best policy of the class."""
     name = "the class of policies is too small"
     remedy = "further observations, --policy mlp with more hidden units, or model predictive control (--preset mpc)"
+    if run.physics.end_cost is not None:
+        return Reason(name, None, "model predictive control does not consider that an episode may end early", remedy)
     known = run.config.limit()
     window = run.config.twinning.planner.receding_horizon if known is None else known.window
     if window is None:

@@ -104,8 +104,8 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
         )
         reasons.append(
             f"plant {plant.name!r} ended it (ended) after {n} of {plant.n_steps} control intervals, at {state}; "
-            f"{SHORTEST} are needed at least: begin with a controller that lasts (--start controller), or take a "
-            "smaller dt"
+            f"{SHORTEST} are needed at least: begin with a controller that lasts (--start controller), explore less "
+            "(--twinning.exploration.spread), or take a smaller dt"
         )
     whole = (n == plant.n_steps or (over and n >= SHORTEST)) and all(sound)
     parts = list(zip(starts, ends, strict=True))
