@@ -369,6 +369,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         f"{paid['episodes']} episodes{judging}, largest {most}"
     )
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
+    lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(found.get("twin"))
     errors = found.get("twin", {}).get("standard_errors", {})

@@ -165,6 +165,7 @@ class Run:
                 self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
             elif real is not None and config.preflight:
                 self.algorithm.flights.check = self._require_wiring
+            self._doubts: tuple[str, ...] = ()
         except BaseException:
             self._held.release()
             raise
@@ -211,8 +212,10 @@ class Run:
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
 
     def _require_wiring(self, record: Trajectory) -> None:
-        """Refuse a real system whose first flight shows a mistake in its wiring."""
-        check_record(record, self.algorithm.twin.plant, self.initial_closure).require()
+        """Refuse a real system whose first flight shows a mistake in its wiring, and keep the doubts for the report."""
+        wiring = check_record(record, self.algorithm.twin.plant, self.initial_closure)
+        wiring.require()
+        self._doubts = wiring.doubts
 
     def train(self) -> dict[str, Any]:
         """Train, evaluate and write the results.
@@ -315,6 +318,8 @@ class Run:
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
         record |= results.twin_entries(self.algorithm.twin)
+        if self._doubts:
+            record["doubts"], self._doubts = list(self._doubts), ()
         if self.algorithm.flights.faults:
             record["faults"] = [fault._asdict() for fault in self.algorithm.flights.faults]
             for fault in self.algorithm.flights.faults:

@@ -7,13 +7,16 @@ state, :math:`\hat s_{k+1} = \Phi(s_k, a_k, z_k)`, and what it leaves unexplaine
 
 The coefficients of the closure are fitted first, so that ordinary model error counts as little as it can. If too much
 is left, the same is done for every mistake of a list. One that leaves much less, :math:`\sum_i \log q_i` lower by
-``MARGIN``, is named.
+``MARGIN``, is named. A large share that no mistake explains is a warning and no refusal, because noise of sensors and
+dynamics that the twin lacks leave up to all of the movement unexplained, too.
 """
 
 import copy
 import itertools
 import math
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +26,9 @@ from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 
+from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import bounds, differences
+from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -36,6 +40,12 @@ ROWS = 200
 """Greatest number of intervals of a record that are looked at."""
 EXPLAINED = 3e-3
 """Share of the movement of a state that a twin with fitted coefficients may leave unexplained without a question."""
+DOUBTFUL = 0.2
+"""Share of the movement of a state beyond which a warning names the state."""
+REFITTED = 5.0
+"""Factor between first and fitted value of a coefficient beyond which both are printed."""
+DRAWS, BEYOND = 10, 3.0
+"""Drawn courses of the inputs that readings are compared with, and the factor by which readings may leave them."""
 FLOOR = 3e-4
 """Share below which a prediction counts as exact, whatever the digits of sensors and integrators."""
 MARGIN = math.log(8.0)
@@ -51,7 +61,9 @@ RATIOS = (0.1, 0.2, 0.25, 0.4, 0.5, 2.0, 2.5, 4.0, 5.0, 10.0)
 CORRELATION = 3.0
 """Correlation time of the noise, in control intervals: noise that is new in each one hardly moves a slow plant."""
 STILL, RESOLUTION = 1e-9, 1e-3
-"""Movement of a state, as a share of its size: below the first it does not move, and beyond the second it shows."""
+"""Movement or error of a state, as a share of its size: below the first it is none, and beyond the second it shows."""
+FACTORS = (1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
+"""Factors that are tried for each state and input, and for all states of a unit together, beside ``UNITS``."""
 UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "rad": (("deg", math.pi / 180.0, 0.0),),
     "rad/s": (("deg/s", math.pi / 180.0, 0.0), ("rpm", math.pi / 30.0, 0.0)),
@@ -60,7 +72,7 @@ UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "K": (("°C", 1.0, 273.15), ("°F", 5.0 / 9.0, 459.67 * 5.0 / 9.0)),
     "°C": (("K", 1.0, -273.15), ("°F", 5.0 / 9.0, -32.0 * 5.0 / 9.0)),
     "Pa": (("kPa", 1e3, 0.0), ("bar", 1e5, 0.0)),
-    "m": (("mm", 1e-3, 0.0),),
+    "m": (("cm", 1e-2, 0.0), ("mm", 1e-3, 0.0)),
     "m/s": (("km/h", 1.0 / 3.6, 0.0),),
     "m³": (("L", 1e-3, 0.0),),
     "W": (("kW", 1e3, 0.0),),
@@ -69,8 +81,11 @@ UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "-": (("%", 1e-2, 0.0),),
 }
 """For a unit of a plant, others in which a value may come, with their size in it and their zero."""
-LEVELS = 5
-"""Number of constant actions over the range of each that are tried."""
+LEVELS, LASTING = 5, 1e-3
+"""Number of constant actions over the range of each that are tried, and the share of the horizon that noise must last.
+
+A slow actuator filters away what is shorter, as if no action arrived.
+"""
 
 
 class WiringError(ValueError):
@@ -81,7 +96,7 @@ class Flown(NamedTuple):
     """Control intervals of short flights, as they were read or as a mistake would have them; ``n`` rows each.
 
     The earlier actions and inputs are those of the interval before; ``ratio`` is the real control interval by the
-    plant's.
+    plant's, and ``signs`` are those of the equations of the states.
     """
 
     t: Float[Tensor, " n"]
@@ -92,6 +107,7 @@ class Flown(NamedTuple):
     earlier_actions: Float[Tensor, "n n_a"]
     earlier_exogenous: Float[Tensor, "n n_z"]
     ratio: float = 1.0
+    signs: Float[Tensor, " n_s"] | float = 1.0
 
 
 class Suspicion(NamedTuple):
@@ -114,14 +130,19 @@ class Wiring(NamedTuple):
         plant: plant that gives the states.
         present: the wiring as it is; ``error`` is the RMS error of one-step predictions, in the units of the states.
         moved: RMS movement of each state in an interval, in its unit.
-        mistakes: the readings that stand still where the twin moves, of which no other wiring is tried; or the mistakes
-            that fit much better, the best one first. Empty if the wiring is right or nothing fits.
+        mistakes: the readings that are wrong by themselves, of which no other wiring is tried: a state that stands
+            still where the twin moves, two signals with the same readings, an input far outside its draws; or the
+            mistakes that fit much better, the best one first. Empty if the wiring is right or nothing fits.
+        doubts: where no mistake is named, the states of whose movement much is unexplained, in words.
+        refitted: where no mistake is named, first and fitted value of each coefficient in which they are far apart.
     """
 
     plant: Plant
     present: Suspicion
     moved: Float[Tensor, " n_s"]
     mistakes: tuple[Suspicion, ...]
+    doubts: tuple[str, ...] = ()
+    refitted: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
@@ -138,19 +159,26 @@ class Wiring(NamedTuple):
             rows.append(
                 f"  much less is unexplained if {mistake.mistake}: {shares}" if shares else f"  {mistake.mistake}"
             )
+        rows += [f"  {doubt}" for doubt in self.doubts]
+        rows += [
+            f"  the fit takes {name} from {first:.4g} to {fitted:.4g}; check units and dt"
+            for name, (first, fitted) in self.refitted.items()
+        ]
         return "\n".join(rows)
 
     def require(self) -> None:
-        """Refuse a system whose wiring does not fit.
+        """Refuse a system whose wiring does not fit, and warn of its doubts.
 
         Raises:
-            WiringError: if a mistake fits much better, or a reading stands still where the twin moves.
+            WiringError: if there are mistakes.
         """
         if self.mistakes:
             raise WiringError(
                 f"the real system does not fit its plant: {self}\nMend Reading or Actuation (keys, order, scale, "
                 "offset), or the plant. Where all is as it should be, --no-preflight trains without this check."
             )
+        for doubt in self.doubts:
+            warnings.warn(doubt, stacklevel=2)
 
 
 def check_real_system(
@@ -166,7 +194,8 @@ def check_real_system(
 
     The real system flies ``STARTS`` times ``INTERVALS`` control intervals, with noise on the commands, because what
     does not move shows nothing. The sequence of its episodes then goes on as if nothing had been flown. A reading that
-    stands still where the twin moves by more than ``RESOLUTION`` is a mistake, too.
+    stands still where the twin moves by more than ``RESOLUTION`` is a mistake, too, as are two signals with the same
+    readings, and an input far outside what ``plant.draw_exogenous`` draws.
 
     Args:
         env: the real system, of batch size 1.
@@ -198,27 +227,87 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
 def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     plant = copy.deepcopy(plant).cpu()
     fit = _Fit(plant, closure)
+    first = fit.coefficients()
     present, (moved, moves) = fit.suspicion("", flown), fit.movement(flown)
+    fitted, explained = fit.coefficients(), not (present.unexplained > EXPLAINED).any()
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
-    names, unknown = (signal.name for signal in plant.states), torch.full_like(moved, torch.nan)
-    mistakes = [
-        Suspicion(f"the reading of state {name} stands still, and the twin moves", unknown, present.error)
+    names = [signal.name for signal in plant.states]
+    wrong = [
+        f"the reading of state {name} stands still, and the twin moves"
         for name, stands in zip(names, stuck, strict=True)
         if stands
     ]
-    if not mistakes and (present.unexplained > EXPLAINED).any():
-        mistakes = _better(present, fit, list(_mistakes(plant, flown)))
-    return Wiring(plant, present, moved, tuple(mistakes))
+    wrong += [*_same_readings(plant, flown, explained), *_strange_inputs(plant, flown)]
+    unknown = torch.full_like(moved, torch.nan)
+    mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
+    if not mistakes and not explained:
+        mistakes = _better(present, fit, flown, list(_mistakes(plant, flown)))
+    if mistakes:
+        return Wiring(plant, present, moved, tuple(mistakes))
+    refitted = {name: (first[name], value) for name, value in fitted.items() if _far(first[name], value)}
+    return Wiring(plant, present, moved, (), tuple(_doubts(plant, present)), refitted)
 
 
-def _better(present: Suspicion, fit: "_Fit", mistakes: list[tuple[str, Flown]]) -> list[Suspicion]:
-    """The mistakes that fit much better than the wiring as it is, one of a kind."""
-    promising = sorted(mistakes, key=lambda mistake: fit.score(mistake[1]))[:FITTED]
-    tried = sorted((fit.suspicion(*mistake) for mistake in promising), key=lambda one: one.score)
-    limit = min(present.score, tried[0].score + 2.0 * MARGIN) - MARGIN
+def _far(first: float, fitted: float) -> bool:
+    """Whether two values of a coefficient differ by more than the factor; of a first value of 0 nobody knows."""
+    return first != 0.0 and not 1.0 / REFITTED <= fitted / first <= REFITTED
+
+
+def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
+    """What no mistake explains and may be right all the same."""
+    shares = zip(plant.states, present.unexplained.tolist(), strict=True)
+    if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
+        yield (
+            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a "
+            "mistake in a Reading, an Actuation or the plant's equations"
+        )
+
+
+def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
+    """Which states have the readings of an input, or of another state if the twin does not move as they do."""
+    signals = [f"state {signal.name}" for signal in plant.states] + [f"input {signal.name}" for signal in plant.inputs]
+    readings = torch.cat([flown.states, flown.exogenous], -1)
+    for k, m in itertools.combinations(range(len(signals)), 2):
+        alike = torch.equal(readings[:, k], readings[:, m]) and bool((readings[:, k] != readings[0, k]).any())
+        if alike and k < len(plant.states) and not (explained and m < len(plant.states)):
+            yield f"{signals[k]} and {signals[m]} have the same readings"
+
+
+def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
+    """Which inputs are read far outside what the plant draws, or at a small share of it."""
+    if not plant.inputs:
+        return
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
+    for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
+        low, high, size = course.min().item(), course.max().item(), course.abs()
+        width = high - low or size.max().item()
+        outside = max(low - read.min().item(), read.max().item() - high)
+        if width > 0.0 and (outside > (BEYOND - 1.0) * width or BEYOND * read.abs().max() < size.min()):
+            yield (
+                f"input {signal.name} is read between {read.min():.4g} and {read.max():.4g} {signal.unit}, where "
+                f"draw_exogenous of the plant draws {low:.4g} to {high:.4g}"
+            )
+
+
+def _better(present: Suspicion, fit: "_Fit", flown: Flown, mistakes: list[tuple[str, Flown]]) -> list[Suspicion]:
+    """The mistakes that fit much better than the wiring as it is, one of a kind.
+
+    A mistake in the reading of a state must leave at most half of that state. Where no error of the present wiring
+    shows beside the size of its state, a mistake must explain all movement.
+    """
+    shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any()
+    enough = torch.where(present.unexplained > 2.0 * EXPLAINED, 0.5 * present.unexplained, EXPLAINED)
+    tried = []
+    for words, mended in sorted(mistakes, key=lambda mistake: fit.score(mistake[1]))[:FITTED]:
+        mistake = fit.suspicion(words, mended)
+        changed = (mended.states != flown.states).any(0)
+        limit = torch.where(changed, enough, torch.inf) if shows else EXPLAINED
+        if not (mistake.unexplained > limit).any():
+            tried.append(mistake)
+    tried.sort(key=lambda mistake: mistake.score)
     kinds: dict[str, Suspicion] = {}
     for mistake in tried:
-        if mistake.score < limit:
+        if mistake.score < min(present.score, tried[0].score + 2.0 * MARGIN) - MARGIN:
             kinds.setdefault(mistake.mistake.partition(",")[0], mistake)
     return list(kinds.values())
 
@@ -262,7 +351,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
         env.load_state_dict(kept)
     if not rows:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    return Flown._make([*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)), 1.0])
+    return Flown._make([*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)), 1.0, 1.0])
 
 
 def _movement(plant: Plant, flown: Flown) -> Float[Tensor, "n n_s"]:
@@ -288,15 +377,28 @@ class _Fit:
         """A wiring with the coefficients that fit it best."""
         if self._weights:
             self._known = self._fitted(flown)
-        return self._suspicion(mistake, flown, self._known)
+        return self._suspicion(mistake, flown, self._errors(flown, self._known)[0])
+
+    def coefficients(self) -> dict[str, float]:
+        """The latest scalar coefficients by name, in physical units."""
+        named = named_weights(self._closure) or {}
+        return {name: value for name, value in named.items() if isinstance(value, float)}
 
     def score(self, flown: Flown) -> float:
-        """Score of a wiring with the coefficients of the first guess or of the last fit, whichever are better."""
-        return min(self._suspicion("", flown, weights).score for weights in (self._guess, self._known))
+        """Score of a wiring with the coefficients of the first guess or the last fit, or a linear fit about them."""
+        scores = []
+        for weights in (self._guess, self._known):
+            error, slopes = self._errors(flown, weights)
+            scores.append(self._suspicion("", flown, error).score)
+            size, moves = self.movement(flown)
+            target, rows = (error / size)[:, moves].flatten(), (slopes / size[:, None])[:, moves].flatten(0, 1)
+            if len(weights) and target.isfinite().all() and rows.isfinite().all():
+                change = torch.linalg.lstsq(rows, target, driver="gelsd").solution
+                scores.append(self._suspicion("", flown, error - slopes @ change).score)
+        return min(scores)
 
-    def _suspicion(self, mistake: str, flown: Flown, weights: Tensor) -> Suspicion:
-        error = self._errors(flown, weights)[0].square().mean(0)
-        size, moves = self.movement(flown)
+    def _suspicion(self, mistake: str, flown: Flown, errors: Tensor) -> Suspicion:
+        error, (size, moves) = errors.square().mean(0), self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
         return Suspicion(mistake, share, error.sqrt())
 
@@ -338,41 +440,64 @@ class _Fit:
         except DivergenceError:
             nan = torch.full_like(flown.ends, torch.nan)
             return nan, nan[..., None].expand(-1, -1, len(weights))
-        share = flown.ratio / steps
+        share = flown.signs * torch.full((flown.states.shape[-1],), flown.ratio / steps, dtype=torch.float64)
         movement = share * differences(self._plant.states, ends[:, -1], flown.states)
         error = _movement(self._plant, flown) - movement
-        return differences(self._plant.states, error, torch.zeros_like(error)), share * slopes[:, -1]
+        return differences(self._plant.states, error, torch.zeros_like(error)), share[:, None] * slopes[:, -1]
 
 
 def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
     """Flights as they would be with each mistake mended, and the mistake in words."""
-    for what, signals, names in (
-        ("state", plant.states, ("states", "ends")),
-        ("action", plant.actions, ("actions",)),
-        ("input", plant.inputs, ("exogenous",)),
-    ):
-        for k, signal in enumerate(signals):
-            yield f"{what} {signal.name} has the other sign", _changed(flown, names, k, -1.0, 0.0)
-            if what == "action" and signal.low != -signal.high:
-                mirrored = _changed(flown, names, k, -1.0, signal.low + signal.high)
-                yield f"action {signal.name} runs from the other end of its range", mirrored
-            for unit, scale, offset in UNITS.get(signal.unit, ()):
-                words = f"{what} {signal.name} is in {unit}, where the plant has {signal.unit}"
-                yield words, _changed(flown, names, k, scale, offset)
-        for k, m in itertools.combinations(range(len(signals)), 2):
-            order = list(range(len(signals)))
-            order[k], order[m] = m, k
-            swapped = {name: getattr(flown, name)[:, order] for name in names}
-            yield f"{what}s {signals[k].name} and {signals[m].name} are in the other order", flown._replace(**swapped)
+    yield from _signal_mistakes("state", plant.states, flown, ("states", "ends"))
+    yield from _signal_mistakes("action", plant.actions, flown, ("actions",))
+    yield from _signal_mistakes("input", plant.inputs, flown, ("exogenous",))
+    for unit in dict.fromkeys(signal.unit for signal in plant.states):
+        alike = [k for k, signal in enumerate(plant.states) if signal.unit == unit]
+        for words, scale, offset in _units(unit, FACTORS) if len(alike) > 1 else ():
+            changed = flown
+            for k in alike:
+                changed = _changed(changed, ("states", "ends"), k, scale, offset)
+            yield f"all states in {unit} are {words}", changed
+    for signal, signs in zip(plant.states, 1.0 - 2.0 * torch.eye(len(plant.states)).double(), strict=True):
+        yield f"the equation of state {signal.name} has the other sign", flown._replace(signs=signs)
     for ratio in RATIOS:
         yield f"dt is another one, {ratio * plant.dt:g} s and not {plant.dt:g} s", flown._replace(ratio=ratio)
     yield "an action acts one interval late", flown._replace(actions=flown.earlier_actions)
     if plant.inputs:
         yield "an input is read one interval late", flown._replace(exogenous=flown.earlier_exogenous)
     for k, signal in enumerate(plant.actions):
-        for level in torch.linspace(signal.low, signal.high, LEVELS).tolist():
+        if signal.low != -signal.high:
+            mirrored = _changed(flown, ("actions",), k, -1.0, signal.low + signal.high)
+            yield f"action {signal.name} runs from the other end of its range", mirrored
+        levels = LEVELS if LASTING * plant.n_steps <= CORRELATION else 0
+        for level in torch.linspace(signal.low, signal.high, levels).tolist():
             constant = _changed(flown, ("actions",), k, 0.0, level)
             yield f"action {signal.name} does not arrive, a constant one fits", constant
+
+
+def _signal_mistakes(
+    what: str, signals: Sequence[Signal], flown: Flown, names: tuple[str, ...]
+) -> Iterator[tuple[str, Flown]]:
+    """The signs, units and orders of one kind of signals, whose values the flights hold under the names."""
+    for k, signal in enumerate(signals):
+        yield f"{what} {signal.name} has the other sign", _changed(flown, names, k, -1.0, 0.0)
+        for words, scale, offset in _units(signal.unit, () if what == "action" else FACTORS):
+            yield f"{what} {signal.name} is {words}", _changed(flown, names, k, scale, offset)
+    for k, m in itertools.combinations(range(len(signals)), 2):
+        order = list(range(len(signals)))
+        order[k], order[m] = m, k
+        swapped = {name: getattr(flown, name)[:, order] for name in names}
+        yield f"{what}s {signals[k].name} and {signals[m].name} are in the other order", flown._replace(**swapped)
+
+
+def _units(unit: str, factors: Sequence[float]) -> Iterator[tuple[str, float, float]]:
+    """In which other unit, or how many times too large, a value may come: words, size and zero."""
+    others = UNITS.get(unit, ())
+    for other, scale, offset in others:
+        yield f"in {other}, where the plant has {unit}", scale, offset
+    for factor in factors:
+        if all(not 0.5 < factor / scale < 2.0 for _, scale, _ in others):
+            yield f"read {1.0 / factor:g} times as large as it is", factor, 0.0
 
 
 def _changed(flown: Flown, names: tuple[str, ...], column: int, scale: float, offset: float) -> Flown:
