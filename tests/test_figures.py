@@ -349,6 +349,13 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
     assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
 
 
+@pytest.mark.parametrize("where", ["", "on the twin"])
+def test_the_title_of_a_single_panel_is_whole(where):
+    costs = {name: found._replace(merit={}) for name, found in judged("model_based", "model_free", "PI").items()}
+    figure = figures.unseen(costs, {}, where=where)
+    assert "bar: mean" in " ".join(draw(figure)) and clipped_texts(figure) == []
+
+
 @pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (0.0, "linear"), (-0.5, "linear")])
 def test_only_positive_costs_have_a_logarithmic_axis(oscillator, least, scale):
     found = judged("model_based", "model_free", "on-off", "Jonkman")

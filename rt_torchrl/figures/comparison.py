@@ -82,7 +82,9 @@ def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count
     quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
     quantities |= {name: {who: found.merit[name] for who, found in judged.items()} for name in first.merit}
     count = len(first.control_costs)
-    title = f"{count} unseen episodes{f' {where}' if where else ''}, a point each; bar: mean"
+    place = f" {where}" if where else ""
+    between = " " if first.merit else "\n"  # a single panel is narrower than the title in one line
+    title = f"{count} unseen episodes{place},{between}a point each; bar: mean"
     figure, axes = panels(1, len(quantities), title=title, size=(max(4.5, 3.1 * len(quantities)), 4.2))
     kinds = {kind: array(chosen) for kind, chosen in categories.items()} or {"": np.ones(count, dtype=bool)}
     for ax, (name, values) in zip(axes.flat, quantities.items(), strict=True):
