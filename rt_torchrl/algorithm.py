@@ -39,7 +39,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role, TwinningConfig
+from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
 from rt_torchrl.steps.imitation import TWICE, Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
@@ -237,8 +237,9 @@ class ReinforcementTwinning(TensorDictSequential):
                 self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
         found = self.steps["switch"].imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
-        ratios = [found[f"start_cost_ratio_{role}"] for role in pupils if f"start_cost_ratio_{role}" in found]
-        if self.first.teacher is not None and "model_based" in pupils and max(ratios, default=0.0) > TWICE:
+        # Of two policies of one architecture, the first alone imitates, and the other takes its weights.
+        ratios = (found[key] for role in ROLES if (key := f"start_cost_ratio_{role}") in found)
+        if self.first.teacher is not None and "model_based" in pupils and next(ratios, 0.0) > TWICE:
             # Nobody lets the real system fly what the twin says costs twice as much as the controller does.
             found = merged(found, self._sound(self.steps["plan"], TensorDict({"number": self.episodes_done})))
         if len(records[-1].actions) != self.twin.plant.n_steps:
