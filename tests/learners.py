@@ -6,7 +6,7 @@ library's own: replay, initial weights, units of the policy, order of updates, l
 precision. With SAC, stable-baselines3 explores by the noise of its policy, and this library by that of its step 1.
 
 The table has the return in 20 unseen episodes without noise, median and range over seeds, and the seconds of the
-processor. The same command goes on where it was interrupted; it takes 15 minutes of an idle core.
+processor. The same command goes on where it was interrupted; it takes 20 minutes of an idle core.
 """
 
 import argparse

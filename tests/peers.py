@@ -285,7 +285,7 @@ class Comparison:
         return Result(self.cost(Learned(learner, env)), sum(done), len(done), seconds)
 
     def lines(self):
-        """Lines of code of each part: those that are neither blank nor comments nor docstrings."""
+        """Lines of code of each part, see :func:`code_lines`."""
         wiring, law = (code_lines(getattr(self.recipe, name)) for name in ("real_system", self.system.classical))
         recipe = code_lines(self.recipe) - wiring - law
         predictive = code_lines(Predictive) + code_lines(self.system.rates) + code_lines(self.system.cost)
