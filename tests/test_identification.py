@@ -185,6 +185,20 @@ def test_of_segments_that_are_followed_alike_the_longest_stay():
     assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 30 and (closure.matrix == 30.0).all()
 
 
+def test_whole_records_are_fitted_again_from_what_short_segments_tell():
+    """The first fit of whole records stays in a poor minimum, out of which short segments lead."""
+    closure, starts = LinearClosure(torch.zeros(2, 2)), []
+
+    def fit(length):
+        start = closure.matrix[0, 0].item()
+        starts.append((length, start))
+        torch.nn.init.constant_(closure.matrix, length or 10.0 + start)
+        return length, torch.tensor([0.5 if start == 2.0 else 10.0])
+
+    assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 0
+    assert starts == [(0, 0.0), (2, 0.0), (0, 2.0)] and (closure.matrix == 12.0).all()
+
+
 class Runaway(Line):
     """ẏ = a y³ − y, which is infinite after 0.73 s for a = 1.3 and y(0) = 1, and decays for a = 0.5."""
 

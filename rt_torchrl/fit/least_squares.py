@@ -127,10 +127,11 @@ def over_segments(
 ) -> R:
     """Fit whole records; those of an unstable twin over the longest segments that it follows as well as shorter ones.
 
-    Where the errors over whole records are not small enough, short segments are fitted from the same weights. Where the
-    twin diverges over whole records, they are fitted again, from what the short segments tell. If the twin is stable
-    under that, it lacks something that no segment shows better, and whole records stay. Otherwise segments of a third
-    of the records are fitted, then of a ninth, and so on.
+    Where the errors over whole records are not small enough, short segments are fitted from the same weights, and whole
+    records again from what these tell; the better of the two fits of whole records stays. If the twin is stable under
+    that, it lacks something that no segment shows better, and whole records stay. Otherwise segments of a third of the
+    records are fitted, then of a ninth, and so on, from the same weights or, where the twin diverges over whole records
+    under these, from what the short ones tell.
 
     Args:
         closure: closure with the weights; those of the fit that is returned stay.
@@ -160,12 +161,16 @@ def over_segments(
     short = max(intervals // SHORT, 2)
     whole = explains(0)
     if not whole and short < intervals:
+        first, present = fits.pop(0, None), start
         explains(short)
         probed = fits.pop(short, None)
-        if probed is not None and not (0 in fits and fits[0][1].isfinite().all()):
+        if probed is not None:
             start = probed[2]
-            whole = explains(0)
-        whole = whole or (0 in fits and probed is not None and not unstable())
+            whole = explains(0) or (0 in fits and not unstable())
+        if first is not None:
+            start = present if first[1].isfinite().all() else start
+            if 0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough):
+                fits[0] = first
     length = 0
     while not whole and length != 1:
         length = max((length or intervals) // SHORTENED, 1)
@@ -176,6 +181,11 @@ def over_segments(
     result, _, weights = next(one for one in fits.values() if (one[1] <= APART * least).all())
     closure.load_state_dict(weights)
     return result
+
+
+def _misfit(errors: Tensor, enough: Tensor) -> float:
+    """Mean square of RMS errors, in shares of what is small enough."""
+    return (errors / enough).square().mean().item()
 
 
 @torch.no_grad()
