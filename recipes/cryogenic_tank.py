@@ -21,7 +21,6 @@ from rt_torchrl import (
     ExplorationConfig,
     HypothesesConfig,
     LearnerConfig,
-    LimitConfig,
     PlannerConfig,
     Plant,
     PredictiveConfig,
@@ -32,7 +31,7 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
-from rt_torchrl.envs.cryogenic_tank.controllers import NarrowOnOff, OnOffValve, PIValve
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
@@ -188,12 +187,6 @@ class Config(RunConfig):
     def cost(self) -> PressureCost:
         """The cost that the options ask for."""
         return PressureCost(vented=self.vented_weight, end=self.end_weight)
-
-    def limit(self) -> LimitConfig:
-        if self.command == "duty":  # which changes within hours: a command is held for 10 min
-            return LimitConfig(starts=VALVES, hold=20, window=self.twinning.planner.receding_horizon)
-        # Gradients find no plans of a half-open valve; its many minima want a start that is close to the best one.
-        return LimitConfig(starts=VALVES | {"narrow on-off": NarrowOnOff}, resting=("narrow on-off",))
 
     def wear(self, plant: CryogenicTank) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

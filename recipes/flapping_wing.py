@@ -20,7 +20,6 @@ from rt_torchrl import (
     ExplorationConfig,
     HypothesesConfig,
     LearnerConfig,
-    LimitConfig,
     PlannerConfig,
     Plant,
     PredictiveConfig,
@@ -41,8 +40,8 @@ if TYPE_CHECKING:
 
     from rt_torchrl import Snapshot
 
-# Commands of a tenth of a beat; a plan is made twice a beat. A flight costs 0.2 % more than the limit with plans of
-# 1 s, and 0.1 % more with plans of 1.5 s.
+# Commands of a tenth of a beat; a plan is made twice a beat. A flight with plans of 1 s costs 0.1 % more than one with
+# plans of 1.5 s.
 PREDICTIVE = PredictiveConfig(horizon=1.5, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
 """Model predictive control with ``--twinning.planner.method receding_horizon``."""
 
@@ -196,9 +195,6 @@ class Config(RunConfig):
     def cost(self) -> TrackingCost:
         """The running cost that the options ask for."""
         return TrackingCost(peak=self.peak, energy=self.energy, rate=self.tilt)
-
-    def limit(self) -> LimitConfig:
-        return LimitConfig(starts={"PD": TrimmedPD}, window=self.twinning.planner.receding_horizon)
 
     def believed(self) -> FlappingWing | None:
         """The physics of a twin that is wrong about them, or does not know all; None if it is right."""

@@ -11,7 +11,7 @@ import shlex
 import statistics
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +25,7 @@ import torch
 
 from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
 from rt_torchrl.atomic_file import make_folder, write_atomically, write_results
-from rt_torchrl.evaluation.limits import exact_optimum, few_starts, limit
+from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.interruption import Interrupted, termination_as_interrupt
 from rt_torchrl.options import AtLeastOne, Count
@@ -60,7 +60,6 @@ class Config:
         seeds: number of trainings of each arm on each system, with the seeds from 0 on.
         given: options of every training, in one word with the option, as in --given="--episodes 10 --unseen 100".
         optimum: whether to seek the least cost of the class of policies, by exact gradients on the true system.
-        limit: number of unseen episodes, the first ones, whose clairvoyant optimum is computed; 0 for none.
         jobs: number of trainings side by side, each with one thread; 0 for one on each core.
         backend: where they run: loky for processes on this machine, or ray for the cluster that RAY_ADDRESS names,
             whose machines share the folder.
@@ -75,7 +74,6 @@ class Config:
     seeds: AtLeastOne = 5
     given: str = ""
     optimum: bool = True
-    limit: Count = 0
     jobs: Count = 0
     backend: Literal["loky", "ray"] = "loky"
     quick: bool = False
@@ -83,8 +81,6 @@ class Config:
     log_dir: Path = Path("runs/study")
 
     def __post_init__(self):
-        if self.limit == 1:  # unseen episodes are two or more
-            raise ValueError("limit=1 must be 0, or at least 2.")
         if not self.arms:
             raise ValueError("arms names none; give options, or twinning, model_based or model_free.")
 
@@ -132,12 +128,10 @@ class Config:
                 trainings[system, arm][0].asked()  # a mistake ends it here and not in every training
         return trainings
 
-    def yardsticks(self, training: "Training") -> "dict[str, Yardstick]":
-        """What else is computed for the task and the policies of a training: ``optimum`` and ``limit``."""
-        asked = {"optimum": QUICK_EFFORT if self.quick else {}} if self.optimum else {}
-        asked |= {"limit": {"count": self.limit}} if self.limit else {}
-        place = self.log_dir / "yardsticks"
-        return {kind: Yardstick(kind, training.recipe, training.words, effort, place) for kind, effort in asked.items()}
+    def search(self, training: "Training") -> "Search":
+        """The search for the optimum of the class of policies of a training."""
+        effort = QUICK_EFFORT if self.quick else {}
+        return Search(training.recipe, training.words, effort, self.log_dir / "optima")
 
 
 def named(text: str) -> tuple[str | None, list[str]]:
@@ -228,33 +222,30 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Yardstick:
-    """A cost that does not depend on the training, kept as JSON with what it depends on.
+class Search:
+    """The search for the least cost of a class of policies, kept as JSON with what it depends on.
 
     Args:
-        kind: optimum, or limit.
         recipe: file of the recipe.
         words: options of the recipe.
         effort: how thoroughly it is sought.
         place: folder of the files.
     """
 
-    kind: str
     recipe: Path
     words: tuple[str, ...]
     effort: dict[str, int]
     place: Path
 
     def of(self) -> dict[str, Any]:
-        """What the cost depends on: recipe, task, unseen episodes and effort; an optimum also on the class of policies.
+        """What the cost depends on: recipe, task, unseen episodes, effort and class of policies.
 
         What policies observe may depend on options of every run, such as the preset.
         """
         config = options_of(self.recipe, self.words).effective()
-        of = {"kind": self.kind, "recipe": str(self.recipe.resolve()), "effort": self.effort, "unseen": config.unseen}
-        if self.kind == "optimum":
-            observed = [signal.name for signal in physics_of(config).observations]
-            of |= {"policy": config.policy, "hidden": config.hidden, "observations": observed}
+        of = {"recipe": str(self.recipe.resolve()), "effort": self.effort, "unseen": config.unseen}
+        of |= {"policy": config.policy, "hidden": config.hidden}
+        of |= {"observations": [signal.name for signal in physics_of(config).observations]}
         worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes, "start": config.start}
         return of | task_of(as_written(config)) | worn
 
@@ -262,7 +253,7 @@ class Yardstick:
     def path(self) -> Path:
         """The file."""
         digest = hashlib.sha256(json.dumps(self.of(), sort_keys=True).encode()).hexdigest()
-        return self.place / f"{self.recipe.stem}-{self.kind}-{digest[:12]}.json"
+        return self.place / f"{self.recipe.stem}-{digest[:12]}.json"
 
     def kept(self) -> dict[str, Any] | None:
         """What is kept, or None."""
@@ -283,19 +274,10 @@ class Yardstick:
         plant, physics = plant_of(config), physics_of(config)
         episodes = UnseenEpisodes(plant, config.unseen)
         episodes.physics, episodes.closure = physics, worn_closure(config, plant, config.episodes)
-        costs = self._costs(config, episodes, functools.partial(config.make_policy, physics))
+        best = exact_optimum(episodes, functools.partial(config.make_policy, physics), **self.effort)
+        found = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         self.place.mkdir(parents=True, exist_ok=True)
-        write_results(self.path, {"of": self.of(), **costs})
-
-    def _costs(self, config: RunConfig, episodes: UnseenEpisodes, make_policy: Callable) -> dict[str, Any]:
-        if self.kind == "optimum":
-            best = exact_optimum(episodes, make_policy, **self.effort)
-            return {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
-        if (known := config.limit()) is None:
-            raise ValueError(f"recipe={self.recipe} does not say how the limit is computed; override Config.limit().")
-        few = episodes.first(self.effort["count"])
-        best = limit(few, few_starts(few, known), hold=known.hold, config=known.descent)
-        return {"J_a": best.mean, "costs": best.costs, "details": best.details}
+        write_results(self.path, {"of": self.of(), **found})
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
@@ -315,7 +297,7 @@ def in_a_worker(file: str, kind: str, task: dict[str, Any]) -> str | None:
     return study.failure_of(getattr(study, kind)(**task))
 
 
-def failure_of(task: Training | Yardstick) -> str | None:
+def failure_of(task: Training | Search) -> str | None:
     """Run a task and return what went wrong; ``interrupted`` after Ctrl-C."""
     try:
         task.run()
@@ -326,7 +308,7 @@ def failure_of(task: Training | Yardstick) -> str | None:
     return None
 
 
-def run_all(tasks: Sequence[Training | Yardstick], *, jobs: int = 0, backend: str = "loky") -> list[str]:
+def run_all(tasks: Sequence[Training | Search], *, jobs: int = 0, backend: str = "loky") -> list[str]:
     """Run tasks side by side, with one progress line; one that fails stops no other.
 
     Args:
@@ -416,21 +398,20 @@ def studied(config: Config) -> tuple[list[Comparison], list[str]]:
     """Train what is missing; return the comparison of each system, and what went wrong."""
     trainings, pool = config.trainings(), {"jobs": config.jobs, "backend": config.backend}
     failures = run_all([training for group in trainings.values() for training in group], **pool)
-    yardsticks = {key: {} for key in trainings}
-    for key, group in trainings.items():
+    searches = {}
+    for key, group in trainings.items() if config.optimum else ():
         places = {FinishedRun.read(training.folder).place for training in group if training.finished()}
         # Of a real system that nobody simulates, no gradients are known.
         if places == {"simulation"} and isinstance(group[0].asked(), MakesPlant):
-            yardsticks[key] = config.yardsticks(group[0])
-    distinct = {yardstick.path: yardstick for group in yardsticks.values() for yardstick in group.values()}
-    failures += run_all(list(distinct.values()), **pool)
-    return comparisons_of(trainings, yardsticks), failures
+            searches[key] = config.search(group[0])
+    failures += run_all(list({search.path: search for search in searches.values()}.values()), **pool)
+    return comparisons_of(trainings, searches), failures
 
 
 def comparisons_of(
-    trainings: "dict[tuple[str, str], list[Training]]", yardsticks: "dict[tuple[str, str], dict[str, Yardstick]]"
+    trainings: "dict[tuple[str, str], list[Training]]", searches: "dict[tuple[str, str], Search]"
 ) -> list[Comparison]:
-    """The finished runs of each system by arm, beside their yardsticks.
+    """The finished runs of each system by arm, beside the optimum.
 
     The optimum of a class of policies is the least cost that anybody has found: the search by gradients, or a run that
     ended with a policy of the class.
@@ -440,18 +421,18 @@ def comparisons_of(
         for key, group in trainings.items()
     }
     least: dict[Path, float] = {}
-    for key, runs in finished.items():
-        if runs and "optimum" in yardsticks[key] and (kept := yardsticks[key]["optimum"].kept()):
-            path, sought = yardsticks[key]["optimum"].path, math.inf if kept["J_a"] is None else kept["J_a"]
-            asked = trainings[key][0].asked()
-            least[path] = min([least.get(path, sought), *(run.cost for run in runs if of_the_class(run.live, asked))])
+    for key, search in searches.items():
+        if finished[key] and (kept := search.kept()):
+            path, asked = search.path, trainings[key][0].asked()
+            sought = math.inf if kept["J_a"] is None else kept["J_a"]
+            of_class = (run.cost for run in finished[key] if of_the_class(run.live, asked))
+            least[path] = min([least.get(path, sought), *of_class])
     rows: dict[str, list[Row]] = {}
     for (system, arm), runs in finished.items():
-        of = yardsticks[system, arm]
-        optimum = least.get(of["optimum"].path) if "optimum" in of else None
-        limit = (of["limit"].kept() or {}).get("costs") if "limit" in of else None
+        search = searches.get((system, arm))
         if runs:
-            rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum, limit=limit))
+            optimum = None if search is None else least.get(search.path)
+            rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum))
     return [Comparison(system, of_system) for system, of_system in rows.items()]
 
 

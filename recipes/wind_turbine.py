@@ -23,7 +23,6 @@ from rt_torchrl import (
     DescentConfig,
     HypothesesConfig,
     LearnerConfig,
-    LimitConfig,
     PlannerConfig,
     Plant,
     PredictiveConfig,
@@ -173,9 +172,6 @@ class Config(RunConfig):
         if self.policy == "bias":
             return plant.make_policy(generator, bias=True)
         return super().make_policy(plant, generator)
-
-    def limit(self) -> LimitConfig:
-        return LimitConfig(starts={"Jonkman": JonkmanController}, window=self.twinning.planner.receding_horizon)
 
     def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

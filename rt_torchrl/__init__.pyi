@@ -43,10 +43,8 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
-from .evaluation.clairvoyant import Clairvoyant, clairvoyant
-from .control.forecasts import Decaying, Forecast, Held, Foreseen, Scattered
+from .control.forecasts import Decaying, Forecast, Held
 from .control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
-from .evaluation.limits import LimitConfig
 
 # Identification
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
@@ -104,7 +102,6 @@ __all__ = [
     "BiasedSensor",
     "BoundedPerceptron",
     "CallingSimulator",
-    "Clairvoyant",
     "ClassicalController",
     "Comparison",
     "ConnectedPlant",
@@ -135,7 +132,6 @@ __all__ = [
     "FMUError",
     "FirstController",
     "Forecast",
-    "Foreseen",
     "Held",
     "HypothesesConfig",
     "LaggedActuator",
@@ -143,7 +139,6 @@ __all__ = [
     "Learner",
     "LearnerConfig",
     "LearningMethod",
-    "LimitConfig",
     "Link",
     "LinkLostError",
     "LoadedRun",
@@ -193,7 +188,6 @@ __all__ = [
     "SaturatedMLP",
     "ScaledActuator",
     "ScaledCoefficients",
-    "Scattered",
     "Scenario",
     "Sensor",
     "SensorRecord",
@@ -218,7 +212,6 @@ __all__ = [
     "begin_loading",
     "check_plant",
     "check_real_system",
-    "clairvoyant",
     "compare_runs",
     "configuration",
     "control_cost",

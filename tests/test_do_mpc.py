@@ -15,6 +15,7 @@ import torch
 from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.plants.signal import bounds
 
 HORIZON = 20.0
 SECONDS = 90.0
@@ -128,9 +129,9 @@ def planned(mpc, state, wind):
     own = RecedingHorizon(plant, plant.closure, config)
     n = own.horizon
     theirs = torch.tensor([np.array(mpc.opt_x_num_unscaled["_u", k, 0]).ravel().tolist() for k in range(n)])
-    commands = theirs.double(), own.plan(0.0, state, wind)[0]
-    own.cost.begin(state, wind.unsqueeze(1).expand(-1, n, -1))
-    return [own.cost(own.cost.units(plan[None]))[0].item() for plan in commands]
+    commands, (low, high) = (theirs.double(), own.plan(0.0, state, wind)[0]), bounds(plant.actions)
+    own.cost.begin(state[0], wind.expand(n, -1))
+    return [own.cost(((command - low) / (high - low)).clamp(0.0, 1.0).numpy())[0] for command in commands]
 
 
 def main():

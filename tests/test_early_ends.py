@@ -120,7 +120,7 @@ def test_an_engine_that_integrates_the_field_is_refused():
     with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use native"):
         Rollout(plant, plant.closure, LinearGain(WEAK), engine="odeint_adjoint")
     with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
-        CommandCost(plant, plant.closure)
+        CommandCost(plant, plant.closure, 10)
 
 
 def test_a_replay_goes_on_where_the_record_does():

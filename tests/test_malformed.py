@@ -24,7 +24,6 @@ from torchrl.data import Bounded
 import rt_torchrl
 from rt_torchrl import (
     Actuation,
-    LimitConfig,
     PlantEnv,
     Reading,
     SafetyConfig,
@@ -289,7 +288,6 @@ def configurations():
 
 GOOD_OPTIONS = {
     SafetyConfig: {"interval": 0.1},
-    LimitConfig: {"starts": {}},
     PredictiveConfig: {"horizon": 2.0},
     RunConfig: {},
     Column: {"header": "a", "signal": "b"},

@@ -153,7 +153,6 @@ ROOMS_OF = {
     "cascaded_tanks.py": {"figures", "fit", "runs"},
     "export.py": {"export", "runs"},
     "identify.py": {"fit", "figures", "runs"},
-    "limit.py": {"control", "evaluation", "runs"},
     "paper.py": {"optimisers", "runs", "steps", "systems"},
     "paper_figures.py": {"figures", "runs", "steps"},
     "record_log.py": {"fit", "runs"},

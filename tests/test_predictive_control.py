@@ -1,4 +1,4 @@
-"""Model predictive control in the place of a policy, its forecasts, and plans under several futures."""
+"""Model predictive control: its plans beside quadratic programs and Riccati, its forecasts, and in a policy's place."""
 
 import copy
 import math
@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from printed_commands import blocks
+from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
-from test_optimal_control import least_squares
 
 from rt_torchrl import PlannerConfig, RunConfig, TwinningConfig
-from rt_torchrl.control.forecasts import Decaying, Held, Scattered
+from rt_torchrl.control.forecasts import Decaying
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.systems.collectors import collector_of
@@ -93,6 +94,29 @@ def test_costs_on_twin_and_unseen_episodes_are_those_of_its_flights():
     torch.testing.assert_close(unseen.control_costs(controller), control_cost(PLANT, real))
     with pytest.raises(ValueError, match="start=0.5 of a flight by PredictiveControl must be 0"):
         twin.control(controller, state, exogenous, start=0.5)
+
+
+class Undisturbed(LinearQuadratic):
+    """The plant of the oracle without inputs."""
+
+    inputs = ()
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return super().vector_field(t, state, action, state.new_zeros((*state.shape[:-1], 1)), closure)
+
+    def draw_exogenous(self, batch, generator):
+        return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plant", [LinearQuadratic(dt=2.0, horizon=20.0), Undisturbed(horizon=2.0)])
+def test_model_predictive_control_that_nobody_set_suits_any_plant(plant):
+    """Its window is two commands of an episode of ten; where there are no inputs, none is forecast."""
+    unseen = UnseenEpisodes(plant, 2)
+    controller = PredictiveControl(plant, plant.closure, PredictiveConfig())
+    controller.learn(plant.draw_exogenous(20, seeded()))
+    idle = torch.zeros(2, plant.n_steps, 1, dtype=torch.float64)
+    costs = Rollout(plant, plant.closure).costs(unseen.initial_state, unseen.exogenous, idle)
+    assert unseen.control_costs(controller).mean() < costs.mean()
 
 
 class Movable(LinearQuadratic):
@@ -192,7 +216,7 @@ def first_order(time, dt, *, episodes=40, n=4000):
 
 def test_a_decaying_forecast_goes_to_the_mean():
     mean, time = torch.tensor([1.0, 1.0], dtype=torch.float64), torch.tensor([2.0, 0.5], dtype=torch.float64)
-    found = Decaying(mean, time, dt=0.5)(0.0, NOW, 40)[:, 0]
+    found = Decaying(mean, time, dt=0.5)(0.0, NOW, 40)
     torch.testing.assert_close(found[:, 0], NOW, rtol=0.0, atol=0.0)
     torch.testing.assert_close(found[0, 4], torch.tensor([1.0 + 2.0 / math.e, 1.0 - 2.0 * math.exp(-4.0)]).double())
     torch.testing.assert_close(found[:, -1], mean.expand(2, 2), rtol=1e-3, atol=1e-3)
@@ -205,109 +229,108 @@ def test_the_decay_of_a_first_order_process_is_found():
     torch.testing.assert_close(found.time, torch.tensor([6.0, 30.0]).double(), rtol=0.1, atol=0.0)
 
 
-N = 10
+def matrices(plant):
+    """The interval as s⁺ = A s + B a + D z, by the four terms of Runge and Kutta's scheme, and the weights of L_a."""
+    continuous = np.array(plant.A) + np.array(plant.true_closure)
+    power, total = np.eye(2), np.zeros((2, 2))
+    for order in range(1, 5):
+        total = total + power * plant.dt / order
+        power = power @ continuous * plant.dt / order
+    # total is now dt·(I + A dt/2 + (A dt)²/6 + (A dt)³/24).
+    A = np.eye(2) + continuous @ total
+    return A, total @ np.array(plant.B), total @ np.array(plant.D), np.array(plant.Q), np.array(plant.R)
 
 
-def scattered(size, pairs=2):
-    """Futures about a held input whose deviations grow with time."""
-    steps = torch.arange(N, dtype=torch.float64)
-    rows = [size * steps / N, size * torch.sin(steps)]
-    deviations = torch.stack(rows[:pairs]).unsqueeze(-1)
-    ends = torch.full((1,), 100.0, dtype=torch.float64)
-    return Scattered(Held(), deviations, -ends, ends)
-
-
-def controller(forecast, **options):
-    config = PredictiveConfig(horizon=N * PLANT.dt, tolerance=0.0, iterations=500, **options)
-    return RecedingHorizon(PLANT, PLANT.closure, config, forecast=forecast)
-
-
-def program(s_0, futures, shared):
-    """The optimal variables of all futures, which share their first commands, as a bounded least-squares problem."""
-    later, parts = np.eye(len(futures) * (N - shared)), []
-    for i, z in enumerate(futures):
-        mine = later[i * (N - shared) : (i + 1) * (N - shared)]
-        first = np.eye(shared, shared + len(later))
-        parts.append(least_squares(PLANT, s_0, z, np.concatenate([first, np.pad(mine, ((0, 0), (shared, 0)))])))
-    matrix, side = (np.concatenate(part) for part in zip(*parts, strict=True))
+def quadratic_program(plant, s_0, z, price):
+    """The optimal actions of a window, whose end costs ``price`` |s|², as a bounded least-squares problem."""
+    A, B, D, Q, R = matrices(plant)
+    root, weight, n = np.linalg.cholesky(Q).T, np.sqrt(price / plant.dt), len(z)
+    gain, free, rows, rest = np.zeros((2, n)), s_0.copy(), [], []
+    for now, z_k in zip(np.eye(n), z, strict=True):
+        rows += [root @ gain, np.sqrt(R[0, 0]) * now[None]]
+        rest += [root @ free, np.zeros(1)]
+        gain, free = A @ gain + B * now, A @ free + D[:, 0] * z_k
+    matrix, side = np.concatenate([*rows, weight * gain]), -np.concatenate([*rest, weight * free])
     return lsq_linear(matrix, side, bounds=(-2.0, 2.0), tol=1e-14).x
 
 
-@pytest.mark.parametrize("shared", [1, 3])
-def test_plans_are_those_of_a_quadratic_program(shared):
-    state, now = torch.tensor([[3.0, -1.0], [0.2, 0.1]]).double(), torch.tensor([[0.3], [-0.4]]).double()
-    forecast = scattered(4.0)
-    found = controller(forecast, period=shared * PLANT.dt).plan(0.0, state, now)
-    bounded = 0
-    for episode in range(2):
-        futures = forecast(0.0, now, N)[episode, :, :, 0].numpy()
-        wanted = program(state[episode].numpy(), futures, shared)
-        np.testing.assert_allclose(found[episode, :shared, 0].numpy(), wanted[:shared], atol=2e-4)
-        later = wanted[shared:].reshape(len(futures), -1)
-        np.testing.assert_allclose(found[episode, shared:, 0].numpy(), later.mean(0), atol=2e-4)
+class Scheduled:
+    """A forecast of one's own: inputs that are known beforehand."""
+
+    def __init__(self, inputs, dt):
+        self.inputs, self.dt = inputs, dt
+
+    def __call__(self, t, exogenous, n):
+        first = round(t / self.dt)
+        return self.inputs[:, first : first + n]
+
+
+@pytest.mark.parametrize("price", [0.0, 8.0])
+def test_plans_are_those_of_a_quadratic_program(price):
+    state, inputs = 2.0 * episodes(3)[0], PLANT.draw_exogenous(3, seeded(2))
+    config = PredictiveConfig(horizon=1.0, tolerance=0.0, iterations=300)
+    controller = RecedingHorizon(
+        PLANT,
+        PLANT.closure,
+        config,
+        forecast=Scheduled(inputs, PLANT.dt),
+        terminal=lambda end: price * end.square().sum(-1),
+    )
+    found, bounded = controller.plan(0.4, state, inputs[:, 4]), 0
+    for episode in range(3):
+        wanted = quadratic_program(PLANT, state[episode].numpy(), inputs[episode, 4:14, 0].numpy(), price)
+        np.testing.assert_allclose(found[episode, :, 0].numpy(), wanted, atol=2e-4)
         bounded += (np.abs(wanted) > 2.0 - 1e-9).sum()
     assert bounded > 0
 
 
-def test_without_bounds_the_first_command_is_that_of_the_forecast_alone():
-    """Certainty equivalence; where commands reach their bounds, it no longer holds."""
-    now = torch.tensor([[0.3]]).double()
-    for position, equal in ((0.1, True), (0.5, False)):
-        state = torch.tensor([[position, 0.0]]).double()
-        alone = controller(Held()).plan(0.0, state, now)[0, 0, 0].item()
-        futures = controller(scattered(1.0 if equal else 20.0)).plan(0.0, state, now)[0, 0, 0].item()
-        assert (abs(alone - futures) < 1e-4) == equal
+def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
+    plant = LinearQuadratic(horizon=3.0, noise=0.0)
+    A, B, _, Q, R = matrices(plant)
+    P = solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    value = torch.from_numpy(P * plant.dt)
+    config = PredictiveConfig(horizon=0.3, tolerance=0.0, iterations=200)
+    controller = RecedingHorizon(plant, plant.closure, config, terminal=lambda end: ((end @ value) * end).sum(-1))
+    state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
+    flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
+    s = state.numpy().T
+    for k in range(plant.n_steps):
+        np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
+        s = A @ s - B @ K @ s
+    assert len(controller.solves) == 2 * plant.n_steps and not any(solve.late for solve in controller.solves)
 
 
-def test_the_rest_of_the_last_plans_goes_on_when_a_solve_is_late():
-    state, exogenous = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1, 1).double()
-    config = PredictiveConfig(horizon=N * PLANT.dt, period=2 * PLANT.dt, deadline=1e-9)
-    late = RecedingHorizon(PLANT, PLANT.closure, config, forecast=scattered(1.0))
-    first, second = (late.plan(t, state, exogenous) for t in (0.0, 2 * PLANT.dt))
+def test_late_solves_leave_the_last_plan():
+    state, exogenous = episodes(batch=1)
+    late = RecedingHorizon(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0, period=0.2, deadline=1e-9))
+    first, second = (late.plan(0.1 * k, state, exogenous[:, k]) for k in (0, 2))
     assert [solve.late for solve in late.solves] == [False, True]
-    torch.testing.assert_close(second[:, :-2], first[:, 2:])
+    torch.testing.assert_close(second[:, :-2], first[:, 2:], rtol=0.0, atol=1e-15)
+    assert (second[:, -2:] == first[:, -1]).all()
+    late.begin()
+    late.plan(0.0, state, exogenous[:, 0])
+    assert not late.solves[-1].late  # there is no plan to go on with
 
 
-def test_futures_have_the_moments_of_the_errors():
-    """With as many pairs as intervals are forecast, all second moments of the errors on the records."""
-    records = PLANT.draw_exogenous(4, torch.Generator().manual_seed(0)).cumsum(1)
-    decaying = Decaying.fitted(records, dt=PLANT.dt, horizon=0.5)
-    found = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=5)
-    middle = decaying(0.0, records[:, 3], 6)[:, 0]
-    starts = range(records.shape[1] - 5)
-    errors = torch.cat([records[:, k : k + 6] - decaying(0.0, records[:, k], 6)[:, 0] for k in starts])
-    moments = (errors[..., 0].T @ errors[..., 0] / len(errors)).numpy()
-    spread = torch.cat([found.deviations, -found.deviations])[..., 0]
-    np.testing.assert_allclose((spread.T @ spread / len(spread)).numpy(), moments, atol=1e-12)
-    found.low, found.high = (torch.full((1,), end).double() for end in (-1e3, 1e3))
-    futures = found(0.0, records[:, 3], 6)
-    assert futures.shape == (4, 10, 6, 1)
-    torch.testing.assert_close(futures.mean(1), middle)
-    torch.testing.assert_close(futures[:, :5] - middle.unsqueeze(1), spread[:5, :, None].expand(4, -1, -1, -1))
-    one = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=1).deviations[0, :, 0].numpy()
-    assert one @ moments @ one / (one @ one) == pytest.approx(np.linalg.eigvalsh(moments)[-1])
-
-
-@pytest.mark.parametrize(("name", "change"), [("held", 0.0), ("decaying", 0.0), ("scattered", 1e-2)])
-def test_its_forecast_is_that_of_the_inputs_met_and_is_kept(name, change):
+@pytest.mark.parametrize("name", ["held", "decaying"])
+def test_its_forecast_is_that_of_the_inputs_met_and_is_kept(name):
     (state, exogenous), records = episodes(seed=2), PLANT.draw_exogenous(9, seeded(9)).cumsum(1)
     policy, again = control(forecast=name), control(forecast=name)
     held, before = (each.fly(state, exogenous).actions for each in (control(forecast="held"), policy))
-    torch.testing.assert_close(before, held, rtol=change, atol=change)  # nothing is met yet
+    torch.testing.assert_close(before, held, rtol=0.0, atol=0.0)  # nothing is met yet
     policy.learn(records[:, :6])  # shorter than the window
-    if name == "scattered":
-        deviations = policy.forecast.deviations
-        assert deviations.shape == (4, 10, 1) and (deviations[:, 5:] == deviations[:, 5:6]).all()
     policy.learn(records)
     fitted = Decaying.fitted(records, dt=PLANT.dt, horizon=1.0)
     if name == "decaying":
         assert torch.equal(policy.forecast.mean, fitted.mean) and torch.equal(policy.forecast.time, fitted.time)
-    if name == "scattered":
-        scatter = Scattered.fitted(fitted, records, dt=PLANT.dt, horizon=1.0)
-        assert torch.equal(policy.forecast.deviations, scatter.deviations[:, :10])
-        assert torch.equal(policy.forecast.low, records.amin((0, 1)))
-        assert torch.equal(policy.forecast.high, records.amax((0, 1)))
     again.load_state_dict(policy.state_dict())
     after = policy.fly(state, exogenous).actions
     assert torch.equal(again.fly(state, exogenous).actions, after)
     assert torch.equal(after, before) == torch.allclose(after, before, atol=1e-3) == (name == "held")
+
+
+def test_the_code_of_the_page_prints_what_its_table_says(capsys):
+    (code,) = [block for block in blocks("planner.md", "python") if "RecedingHorizon" in block]
+    exec(compile(code, "docs/planner.md", "exec"), {})
+    assert float(capsys.readouterr().out) == pytest.approx(0.01182, abs=1e-5)

@@ -25,7 +25,7 @@ from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 
 MODULES = """
-    control.command_cost control.forecasts evaluation.clairvoyant evaluation.limits
+    control.command_cost control.forecasts evaluation.optimum
     envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
     envs.cryogenic_tank.saturation envs.cryogenic_tank.unknown envs.flapping_wing.closures
     envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real

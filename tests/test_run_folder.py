@@ -121,7 +121,6 @@ def test_a_run_is_not_resumed_with_other_options(tmp_path, options, named):
 def test_a_run_is_resumed_with_harmless_options(tmp_path):
     begun(tmp_path)
     harmless = {"episodes": 7, "figures": False, "figures_every": 0, "untrained": 0, "threads": 1, "reference": True}
-    harmless["limit_episodes"] = 3
     begun(tmp_path, resume=True, unseen=3, unseen_every=2, compiled=False, **harmless)
     assert json.loads((tmp_path / "config.json").read_text())["episodes"] == 7
     # From now on episodes are judged on three unseen ones; the next are not to be judged on others.

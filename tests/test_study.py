@@ -60,8 +60,7 @@ def rows(tmp_path):
 
 def test_every_number_of_a_table_is_that_by_hand(tmp_path):
     first, second = ([FinishedRun.read(folder) for folder in group] for group in rows(tmp_path))
-    limit = [0.25, 0.75]
-    a, b = Row(name="a", runs=first, optimum=1.0, limit=limit), Row(name="b", runs=second, optimum=1.0, limit=limit[:1])
+    a, b = Row(name="a", runs=first, optimum=1.0), Row(name="b", runs=second, optimum=1.0)
     numbers = Comparison("tanks", [a, b]).numbers()
     assert numbers["controllers"] == {"PI": 2.0}
     of_a, of_b = numbers["rows"]["a"], numbers["rows"]["b"]
@@ -69,8 +68,6 @@ def test_every_number_of_a_table_is_that_by_hand(tmp_path):
     assert of_a["paid"] == {"median": 12.0, "least": 12.0, "greatest": 12.0}  # 2 · (4 + 2)
     assert of_a["regret"]["median"] == 10.0  # beyond two episodes of the optimum
     assert of_a["J_a_ratio"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
-    assert of_a["over_limit"] == {"median": 4.0, "least": 2.0, "greatest": 6.0}  # over the mean of both episodes
-    assert of_b["over_limit"]["least"] == pytest.approx(math.exp(0.1) / 0.25)  # over the first episode alone
     assert of_a["episodes_to_optimum"] == {"median": math.inf, "least": math.inf, "greatest": math.inf}
     assert of_b["episodes_to_optimum"] == {"median": 2.0, "least": 2.0, "greatest": math.inf}
     assert of_a["alarms"]["median"] == of_a["swaps"]["median"] == 1.0 and of_a["seconds"]["median"] == 4.0
@@ -139,9 +136,7 @@ def test_a_panel_of_costs_that_are_all_infinite_is_drawn_empty(tmp_path):
 )
 def test_costs_below_zero_are_above_their_optimum_as_a_share_of_its_size(tmp_path, optimum, shown):
     run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[-0.9, -0.9]))
-    row = Row(name="a", runs=[run], optimum=optimum, limit=[-1.0, 0.0])
-    comparison = Comparison("tanks", [row])
-    assert row.numbers(row)["over_limit"] is None  # a ratio says nothing of costs below zero
+    comparison = Comparison("tanks", [Row(name="a", runs=[run], optimum=optimum)])
     header = [cell.strip() for cell in comparison.table().splitlines()[0].strip("|").split("|")]
     assert dict(zip(header, cells(comparison.table())["a"], strict=True)).get("over the optimum") == shown
 
@@ -258,7 +253,6 @@ def test_systems_and_arms_have_names(tmp_path):
     ("options", "message"),
     [
         ({"seeds": 0}, "seeds=0 must be at least 1"),
-        ({"limit": 1}, "limit=1 must be 0, or at least 2"),
         ({"arms": ()}, "arms names none"),
         ({"arms": ("sac",)}, "'sac' has no name; write NAME=OPTIONS, or one of twinning"),
         ({"arms": ("a=", "a=--patience 2")}, "'a' stands for two"),
@@ -294,12 +288,12 @@ def test_two_arms_and_two_seeds(tmp_path, capsys):
     searched = minimize(cost, optimal_gain(1.0)[0], method="Nelder-Mead").fun
     assert best == pytest.approx(searched, rel=1e-5) and best <= min(finals.values())
     assert "| twinning | 2 |" in capsys.readouterr().out and (tmp_path / "study.png").stat().st_size > 5000
-    (yardstick,) = (tmp_path / "yardsticks").iterdir()
-    kept = yardstick.stat().st_mtime_ns
+    (optimum,) = (tmp_path / "optima").iterdir()
+    kept = optimum.stat().st_mtime_ns
     study.main(config(tmp_path, **arms))
     assert {key: (folder / "metrics.json").read_bytes() for key, folder in folders.items()} == written
-    assert yardstick.stat().st_mtime_ns == kept
-    yardstick.write_text("{")
+    assert optimum.stat().st_mtime_ns == kept
+    optimum.write_text("{")
     with pytest.warns(UserWarning, match=r"\.json is damaged; it is computed again"):
         study.main(config(tmp_path, given="--episodes 2", **arms))
     longer = json.loads((folders["twinning", 0] / "metrics.json").read_text())["episodes"]
@@ -389,25 +383,20 @@ def test_a_cluster_of_ray(tmp_path):
 
 def test_what_an_optimum_depends_on_has_a_file_of_its_own(tmp_path):
     def of(words, **options):
-        return config(tmp_path, **options).yardsticks(study.Training(TINY, tuple(words.split()), 0, tmp_path))
+        return config(tmp_path, **options).search(study.Training(TINY, tuple(words.split()), 0, tmp_path))
 
-    plain = of("")["optimum"]
-    assert plain.path == of("--twinning.arm model_free --episodes 7")["optimum"].path
-    others = [of("--horizon 1.0")["optimum"], of("--unseen 5")["optimum"], of("", quick=True)["optimum"]]
+    plain = of("")
+    assert plain.path == of("--twinning.arm model_free --episodes 7").path
+    others = [of("--horizon 1.0"), of("--unseen 5"), of("", quick=True)]
     elsewhere = tmp_path / TINY.name
     elsewhere.write_text(TINY.read_text())
-    others.append(study.Yardstick("optimum", elsewhere, (), {}, tmp_path / "yardsticks"))
+    others.append(study.Search(elsewhere, (), {}, tmp_path / "optima"))
     assert len({plain.path, *(other.path for other in others)}) == 5
-    assert list(of("", limit=3, optimum=False)) == ["limit"]
-    # The limit belongs to the commands, whatever the policies are; what these observe may follow from the preset.
-    limits = [of(words, limit=3)["limit"] for words in ("", "--policy mlp --hidden 4", "--horizon 1.0")]
-    assert limits[0].path == limits[1].path != limits[2].path
+    # What policies observe may follow from the preset.
     turbine = Path(study.__file__).with_name("wind_turbine.py")
     words = ("--preset paper --policy mlp", "--policy mlp", "--policy mlp --observe paper")
-    made = [study.Yardstick("optimum", turbine, tuple(text.split()), {}, tmp_path) for text in words]
+    made = [study.Search(turbine, tuple(text.split()), {}, tmp_path) for text in words]
     assert made[0].path == made[2].path != made[1].path
-    message = "does not say how the limit is computed"
-    assert message in study.failure_of(of("", limit=3)["limit"])
 
 
 def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
@@ -418,7 +407,7 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         "mpc": (twinning["receding_horizon"], 0.5, "model_based"),
         "other": (("--model-free-policy", "mlp"), 0.4, "model_free"),
     }
-    trainings, yardsticks = {}, {}
+    trainings, searches = {}, {}
     for arm, (words, cost, live) in arms.items():
         folder = leave(tmp_path / arm, seed=0, costs=[cost, cost], arm=arm)
         metrics = json.loads((folder / "metrics.json").read_text())
@@ -428,9 +417,8 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         trainings["tiny", arm] = [
             SimpleNamespace(folder=folder, finished=lambda: True, asked=lambda asked=asked: asked)
         ]
-        searched = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
-        yardsticks["tiny", arm] = {"optimum": searched}
-    (found,) = study.comparisons_of(trainings, yardsticks)
+        searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
+    (found,) = study.comparisons_of(trainings, searches)
     assert [row.optimum for row in found.rows] == [0.9] * 3
 
 

@@ -32,7 +32,7 @@ from rt_torchrl import (
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.evaluation.limits import exact_optimum
+from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of

@@ -27,12 +27,6 @@ class OnOffValve(ClassicalController):
         return self.plant.action_of(is_open * self.gains[0]), is_open
 
 
-class NarrowOnOff(OnOffValve):
-    """An on-off valve whose band is too narrow for a real one; a mixture of shut and open is close to the optimum."""
-
-    half_band = 200.0
-
-
 class PIValve(ClassicalController):
     r"""A proportional and integral law of the pressure error, with an integral that stops where the valve saturates.
 

@@ -6,7 +6,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, TerminalCost, descend
-from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
+from rt_torchrl.control.command_cost import CommandCost, Plan, TerminalCost, descend
+from rt_torchrl.control.forecasts import Decaying, Forecast, Held
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import AtLeastOne, Limit, NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant
@@ -23,13 +22,6 @@ from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, Sta
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import constant
-
-Variables = Float[np.ndarray, "variables n_a"]
-"""Held commands in [0, 1] that several futures share, and below them those of each."""
-PAIRS = 10
-"""Number of pairs that approximate the curvature in a solve."""
-FUTURES = 4
-"""Number of pairs of futures of a scattered forecast."""
 
 
 @configuration
@@ -44,9 +36,9 @@ class PredictiveConfig:
         iterations: greatest number of iterations of L-BFGS-B in a solve.
         tolerance: relative decrease of the cost in an iteration below which a solve ends.
         deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
-        forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, decaying
-            to the mean of the inputs met so far with the time that fits them best, or scattered, several futures about
-            the decaying one as its errors on these inputs scatter; until inputs have been met, they are held.
+        forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, or
+            decaying to the mean of the inputs met so far with the time that fits them best; until inputs have been met,
+            they are held.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
             virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
@@ -60,7 +52,7 @@ class PredictiveConfig:
     iterations: AtLeastOne = 20
     tolerance: NotNegative = 1e-4
     deadline: Limit = math.inf
-    forecast: Literal["held", "decaying", "scattered"] = "decaying"
+    forecast: Literal["held", "decaying"] = "decaying"
     virtual_episodes: AtLeastOne = 3
 
     def length(self, plant: Plant) -> float:
@@ -71,56 +63,16 @@ class PredictiveConfig:
         return hold * max(1, min(20, math.floor(0.25 * plant.horizon / hold + 1e-9)))
 
 
-class SharedCommands:
-    r"""The mean cost of several futures, which share the commands until the next plan, and its gradient, as one point.
-
-    .. math:: J = \frac1S\sum_{i\le S} J_i(u_0, \dots, u_{p-1}, u^{(i)}_p, \dots, u^{(i)}_{m-1})
-
-    At the next plan the input is measured again, so that the later commands are those of one future each. A plan whose
-    commands are shared to the end cannot answer what comes, and is too cautious; a plan for one future is too bold.
-
-    Args:
-        cost: cost of each future, one realisation of its window each.
-        shared: number p of held commands that all futures share, at least 1.
-
-    Source: Lucia, Finkler and Engell, J. Process Control 23 (2013) 1306, with a tree that branches once.
-    """
-
-    def __init__(self, cost: CommandCost, shared: int):
-        self.cost, self.shared = cost, shared
-
-    def point(self, plans: Plans) -> Variables:
-        """The variables of a plan for each future; where they must share commands, the means."""
-        return self._joined(plans[:, : self.shared].mean(0), plans)
-
-    def plans(self, point: Variables, count: int) -> Plans:
-        """The plan of each of ``count`` futures; p is less where the window is shorter."""
-        shared, n_a = min(len(point), self.shared), point.shape[-1]
-        first = np.broadcast_to(point[:shared], (count, shared, n_a))
-        return np.concatenate([first, point[shared:].reshape(count, -1, n_a)], 1)
-
-    def __call__(self, point: Variables, count: int) -> tuple[float, Variables]:
-        """J and its gradient by the variables of ``count`` futures."""
-        costs, slopes = self.cost(self.plans(point, count))
-        return float(costs.mean()), self._joined(slopes[:, : self.shared].sum(0), slopes) / count
-
-    def _joined(self, first: np.ndarray, each: np.ndarray) -> np.ndarray:
-        """What all futures share, and below it what each has of its own."""
-        return np.concatenate([first, each[:, self.shared :].reshape(-1, each.shape[-1])])
-
-
 class Solve(NamedTuple):
     """One solve of model predictive control.
 
     Args:
         seconds: wall-clock time [s].
-        gradients: number of gradients.
         late: whether the deadline passed, so that the last plan went on.
         diverged: whether the model diverged under the last plan, so that this or a constant command went on.
     """
 
     seconds: float
-    gradients: int
     late: bool
     diverged: bool = False
 
@@ -133,9 +85,6 @@ class RecedingHorizon:
     r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
 
     .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
-
-    Under a forecast with several futures the integral is the mean over them. They share the commands until the next
-    plan; later ones answer what has come by then, see :class:`SharedCommands`.
 
     Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
     best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
@@ -168,12 +117,8 @@ class RecedingHorizon:
         self.period = hold if config.period is None else self._whole("period", config.period, hold)
         if self.period > self.horizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.length(plant)} s.")
-        self.cost = CommandCost(plant, constant(closure), hold=hold, terminal=terminal)
-        self._descent = BoundedDescentConfig(
-            iterations=config.iterations, tolerance=config.tolerance, gradient=0.0, memory=PAIRS
-        )
-        self._shared = SharedCommands(self.cost, self.period // hold)
-        self._prepared: np.ndarray | None = None
+        self.cost = CommandCost(plant, constant(closure), self.horizon, hold=hold, terminal=terminal)
+        self._prepared: Plan | None = None
         self.solves: list[Solve] = []
         self.begin()
 
@@ -187,7 +132,7 @@ class RecedingHorizon:
 
     def begin(self) -> None:
         """Begin new episodes; what :meth:`prepare` has planned stays."""
-        self._plans: list[np.ndarray] = []
+        self._plans: list[Plan] = []
         self._commands: Tensor | None = None
 
     def prepare(self, state: Float[Tensor, "1 n_s"], exogenous: Float[Tensor, "1 n_z"]) -> None:
@@ -219,37 +164,30 @@ class RecedingHorizon:
         Raises:
             DivergenceError: if the model diverges under every start of a first plan.
         """
-        n = self.horizon
-        inputs = self.forecast(t, exogenous, n)
         first, found = not self._plans, []
-        for episode in range(len(state)):
+        for episode, coming in enumerate(self.forecast(t, exogenous, self.horizon)):
             safe_point()
-            begins, coming = state[episode].expand(inputs.shape[1], -1), inputs[episode]
             began = time.perf_counter()
-            self.cost.begin(begins, coming, start=t)
+            self.cost.begin(state[episode], coming, start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
             start = starts[0] if len(starts) == 1 else self._cheapest(starts)
             found.append(self._solved(start, last, began))
         self._plans = found
-        return self.cost.commands(np.stack([plans.mean(0) for plans in found]), n)
+        return torch.stack([self.cost.commands(plan) for plan in found])
 
-    def _solved(self, start: np.ndarray, last: np.ndarray | None, began: float) -> np.ndarray:
-        """The plans for the futures of an episode; if it is late or diverges, the last ones go on, if there are any."""
-        count, deadline = 0, math.inf if last is None else self.config.deadline
+    def _solved(self, start: Plan, last: Plan | None, began: float) -> Plan:
+        """The plan of an episode; if it is late or diverges, the last one goes on, if there is one."""
+        config, deadline = self.config, math.inf if last is None else self.config.deadline
 
-        def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
-            nonlocal count
+        def evaluate(plan: Plan) -> tuple[float, Plan]:
             if time.perf_counter() - began > deadline:
                 raise _LateError
-            count += 1
-            cost, gradient = self._shared(point[0], len(start))
-            return cost, gradient[None]
+            return self.cost(plan)
 
         late = diverged = False
         try:
-            best = descend(evaluate, self._shared.point(start)[None], self._descent).point[0]
-            found = self._shared.plans(best, len(start))
+            found = descend(evaluate, start, iterations=config.iterations, tolerance=config.tolerance).point
         except _LateError:
             found, late = start, True
         except FloatingPointError as error:
@@ -257,22 +195,22 @@ class RecedingHorizon:
                 raise DivergenceError(f"plant {self.plant.name!r} diverges in every first plan: {error}") from error
             # A constant command goes on where the model diverges under the last plan too.
             found, diverged = self._cheapest([last, *self._constants()]), True
-        self.solves.append(Solve(time.perf_counter() - began, count, late, diverged))
+        self.solves.append(Solve(time.perf_counter() - began, late, diverged))
         return found
 
-    def _shifted(self, plans: np.ndarray) -> np.ndarray:
-        """The rest of the last plans, whose ends are held for as long as the window needs."""
-        blocks, passed = self.cost.blocks(self.cost.n), self.period // self.cost.hold
-        return plans[:, np.minimum(np.arange(passed, passed + blocks), plans.shape[1] - 1)]
+    def _shifted(self, plan: Plan) -> Plan:
+        """The rest of the last plan, whose end is held for as long as the window needs."""
+        passed = self.period // self.cost.hold
+        return plan[np.minimum(np.arange(passed, passed + len(plan)), len(plan) - 1)]
 
-    def _constants(self) -> list[np.ndarray]:
+    def _constants(self) -> list[Plan]:
         """Constant commands at both ends and the middle of every range."""
-        shape = self.cost.count, self.cost.blocks(self.cost.n), len(self.plant.actions)
+        shape = self.cost.shape
         return [np.full(shape, levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=shape[-1])]
 
-    def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
+    def _cheapest(self, plans: list[Plan]) -> Plan:
         """The plan of the least cost; one that diverges costs more than any other, and the first is taken if all do."""
-        costs = [self._shared(self._shared.point(plan), len(plan))[0] for plan in plans]
+        costs = [self.cost(plan)[0] for plan in plans]
         return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
     def act(self, t: float, state: State, exogenous: Input) -> Action:
@@ -331,7 +269,10 @@ class PredictiveControl(nn.Module):
         devices = {str(weight.device) for weight in (*closure.parameters(), *closure.buffers())} - {"cpu"}
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
-        self.forecast = self._unlearned()
+        self.forecast: Forecast = Held()
+        if config.forecast == "decaying":
+            forever = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
+            self.forecast = Decaying(torch.zeros_like(forever), forever, dt=plant.dt)  # which holds, too
         timeless = dataclasses.replace(config, deadline=math.inf)
         self._acting, self._virtual = (
             RecedingHorizon(plant, closure, chosen, forecast=self.forecast) for chosen in (config, timeless)
@@ -344,18 +285,6 @@ class PredictiveControl(nn.Module):
         """Number of virtual episodes that it flies at a time."""
         return self._config.virtual_episodes
 
-    def _unlearned(self) -> Forecast:
-        """The forecast of the configuration before any inputs have been met: all hold them."""
-        (plant,), config = self._plant, self._config
-        if config.forecast == "held":
-            return Held()
-        still = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
-        decaying = Decaying(torch.zeros_like(still), still, dt=plant.dt)
-        if config.forecast == "decaying":
-            return decaying
-        deviations = still.new_zeros(FUTURES, round(config.length(plant) / plant.dt), len(still))
-        return Scattered(decaying, deviations, -still, still.clone())
-
     def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
 
@@ -363,14 +292,10 @@ class PredictiveControl(nn.Module):
             records: inputs of whole episodes.
         """
         plant = self._plant[0]
-        if not isinstance(self.forecast, Decaying | Scattered) or not plant.inputs:
+        if not isinstance(self.forecast, Decaying) or not plant.inputs:
             return
-        over = {"dt": plant.dt, "horizon": min(self._acting.horizon, records.shape[1] - 1) * plant.dt}
-        fitted: Decaying | Scattered = Decaying.fitted(records, **over)
-        if isinstance(self.forecast, Scattered):
-            fitted = Scattered.fitted(fitted, records, **over, pairs=FUTURES)
-            fitted.deviations = fitted.reaching(self.forecast.deviations.shape[1])
-        self.forecast.load_state_dict(fitted.state_dict())
+        horizon = min(self._acting.horizon, records.shape[1] - 1) * plant.dt
+        self.forecast.load_state_dict(Decaying.fitted(records, dt=plant.dt, horizon=horizon).state_dict())
 
     @property
     def solves(self) -> list[Solve]:

@@ -122,14 +122,11 @@ class Row:
         name: name of the row.
         runs: the runs.
         optimum: least cost that a policy of this class can have on the unseen episodes; None if nobody knows it.
-        limit: least cost that any commands can have on each of the first unseen episodes, which has ratios where its
-            mean is positive; None if nobody knows it.
     """
 
     name: str
     runs: Sequence[FinishedRun]
     optimum: float | None = None
-    limit: Sequence[float] | None = None
 
     @property
     def costs(self) -> dict[int, float]:
@@ -164,17 +161,11 @@ class Row:
             first: row that this one is compared with; costs of another task are not.
         """
         same = self.runs[0].task == first.runs[0].task
-        over_limit = None
-        if self.limit:
-            least, count = statistics.fmean(self.limit), len(self.limit)
-            if least > 0.0:
-                over_limit = [statistics.fmean(run.costs[:count]) / least for run in self.runs]
         return {
             "seeds": sorted(self.costs),
             "J_a": spread(list(self.costs.values())),
             "J_a_ratio": paired_ratio(self.costs, first.costs) if same else None,
             "optimum": self.optimum,
-            "over_limit": spread(over_limit),
             "paid": spread(list(self.paid.values())),
             "paid_ratio": paired_ratio(self.paid, first.paid) if same else None,
             "regret": spread(self.regret),
@@ -265,7 +256,6 @@ class Comparison:
                     str(len(row["seeds"])),
                     with_range(row["J_a"]),
                     above(row["J_a"]["median"], row["optimum"]),
-                    with_range(row["over_limit"]),
                     with_interval(row["J_a_ratio"]),
                     with_range(row["paid"]),
                     with_interval(row["paid_ratio"]),
@@ -276,12 +266,12 @@ class Comparison:
             )
             merits[name] = row["merit"]
         for name, (cost, merit) in self.controllers().items():
-            lines.append([name, "", f"{cost:.4g}", *[""] * 10])
+            lines.append([name, "", f"{cost:.4g}", *[""] * 9])
             merits[name] = merit
         optima = {row.optimum: row.name for row in reversed(self.rows) if row.optimum is not None}
         for cost, name in reversed(optima.items()):
-            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 10])
-        header = ["", "seeds", "J_a", "over the optimum", "over the limit", f"J_a over {first}", "Σ J_a"]
+            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 9])
+        header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
         header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "role changes", "seconds"]
         kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
         tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]

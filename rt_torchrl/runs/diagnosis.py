@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from rt_torchrl.evaluation.limits import exact_optimum, predictive
+from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.loaded_run import LoadedRun
@@ -49,9 +50,10 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
     policy, believed = run.policy(run.live), run.twin.believed
     unseen = UnseenEpisodes(believed.plant, episodes)
     unseen.closure, unseen.physics = believed.closure, run.physics
-    costs = unseen.control_costs(policy)
-    best, minimum = _minimum(run, unseen, costs)
-    return [_twin(run), minimum, _class(run, unseen, best), _inputs(run, costs), _merits(run)]
+    validation, costs = unseen.validation(), unseen.control_costs(policy)
+    assert validation is not None  # the closure of a twin is known
+    best, minimum = _minimum(run, unseen, validation, costs)
+    return [_twin(run), minimum, _class(run, unseen, validation, best), _inputs(run, costs), _merits(run)]
 
 
 def _dearer(costs: Costs, others: Costs, share: float) -> bool | None:
@@ -74,7 +76,7 @@ def _twin(run: LoadedRun) -> Reason:
     return Reason(name, bool(flown[-1]["alarm"]), evidence, remedy)
 
 
-def _minimum(run: LoadedRun, unseen: UnseenEpisodes, costs: Costs) -> tuple[Costs, Reason]:
+def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, costs: Costs) -> tuple[Costs, Reason]:
     """The least costs of this class of policies that are found on the twin, and whether the policy is far above them.
 
     What is best on some episodes is not so on others: weights are sought on validation episodes.
@@ -90,27 +92,28 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, costs: Costs) -> tuple[Cost
     def present(generator: torch.Generator) -> torch.nn.Module:
         return copy.deepcopy(policy)
 
-    chosen_on = unseen.validation()
-    assert chosen_on is not None  # the closure of a twin is known
-    candidates = exact_optimum(chosen_on, drawn), exact_optimum(chosen_on, present, starts=1)
+    candidates = exact_optimum(validation, drawn), exact_optimum(validation, present, starts=1)
     best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
     evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
     return min(costs, best, key=torch.mean), Reason(name, _dearer(costs, best, MINIMUM), evidence, remedy)
 
 
-def _class(run: LoadedRun, unseen: UnseenEpisodes, best: Costs) -> Reason:
-    """Whether a controller that plans at every step is better on the twin than the best policy of the class."""
+def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, best: Costs) -> Reason:
+    """Whether a controller that plans at every step is better on the twin than the best policy of the class.
+
+    One that is worse says nothing: it may lack plans, such as for the tank's half-open valve, or a forecast.
+    """
     name = "the class of policies is too small"
     remedy = "further observations, --policy mlp with more hidden units, or model predictive control (--preset mpc)"
     if run.physics.end_cost is not None:
         return Reason(name, None, "model predictive control does not consider that an episode may end early", remedy)
-    known = run.config.limit()
-    window = run.config.twinning.planner.receding_horizon if known is None else known.window
-    if window is None:
-        return Reason(name, None, "model predictive control finds no plans for this plant", remedy)
-    found = best.new_tensor(predictive(unseen, window).costs)
+    window = run.config.twinning.planner.receding_horizon
+    controller = PredictiveControl(unseen.plant, unseen.known_closure(), window)
+    controller.learn(validation.exogenous)
+    found = unseen.control_costs(controller)
     evidence = f"model predictive control costs {found.mean():.4g} on the twin, the best of the class {best.mean():.4g}"
-    return Reason(name, _dearer(best, found, CLASS), evidence, remedy)
+    holds = None if _dearer(found, best, CLASS) else _dearer(best, found, CLASS)
+    return Reason(name, holds, evidence, remedy)
 
 
 def _inputs(run: LoadedRun, costs: Costs) -> Reason:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.checks import rms_error, visited_features
-from rt_torchrl.evaluation.limits import Contender, LimitConfig, exact_optimum, few_starts, limit, predictive
+from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
@@ -260,40 +260,14 @@ def reference_entry(
     if not config.reference:
         return {}
     optimum = exact_optimum(unseen, make_policy)
-    known = config.limit() if config.limit_episodes else None
-    compared = {
-        "J_a": optimum.cost,
-        "J_a_of_each_start": optimum.costs,
-        "J_a_by_gradients": optimum.by_gradients,
-        "better_over_reference": better.mean().item() / optimum.cost,
+    return {
+        "reference": {
+            "J_a": optimum.cost,
+            "J_a_of_each_start": optimum.costs,
+            "J_a_by_gradients": optimum.by_gradients,
+            "better_over_reference": better.mean().item() / optimum.cost,
+        }
     }
-    if known is not None:
-        few = unseen.first(config.limit_episodes)
-        costs = {"optimum": few.control_costs(optimum.policy), "better": better[: config.limit_episodes]}
-        compared |= {"limit": beside_the_limit(few, known, costs)}
-    return {"reference": compared}
-
-
-def beside_the_limit(episodes: UnseenEpisodes, known: LimitConfig, costs: dict[str, Costs]) -> dict[str, Any]:
-    """The limit, and what policies and model predictive control cost over it on the same episodes.
-
-    Args:
-        episodes: the episodes.
-        known: how the limit is computed.
-        costs: J_a of policies on these episodes, by name.
-    """
-    best = limit(episodes, few_starts(episodes, known), hold=known.hold, config=known.descent)
-    found = {"episodes": len(best.costs), "J_a": best.mean, **entry(best)}
-    found |= {f"{name}_over_limit": cost.mean().item() / best.mean for name, cost in costs.items()}
-    if known.window is None:
-        return found
-    planned = predictive(episodes, known.window)
-    return found | {"mpc": {"J_a": planned.mean, "over_limit": planned.mean / best.mean, **entry(planned)}}
-
-
-def entry(contender: Contender) -> dict[str, Any]:
-    """The plant's own quantities and the details of a contender."""
-    return {"merit": contender.merit, **contender.details}
 
 
 MOST_WEIGHTS = 12
@@ -355,7 +329,6 @@ def results_table(metrics: dict[str, Any]) -> str:
         best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
         lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
-        lines += limit_lines(found["reference"])
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
@@ -394,20 +367,6 @@ def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
         )
         lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
     return lines
-
-
-def limit_lines(reference: dict[str, Any]) -> list[str]:
-    """Lines with the limit and what costs how much over it, or why it was not computed."""
-    if "limit" not in reference:
-        return ["  no limit: the recipe's Config has no limit(), or limit_episodes is 0"]
-    best = reference["limit"]
-    shares = [
-        (name, best[key]) for name, key in (("better policy", "better_over_limit"), ("optimum", "optimum_over_limit"))
-    ]
-    if "mpc" in best:
-        shares.append(("model predictive control", best["mpc"]["over_limit"]))
-    text = ", ".join(f"{name} {_number(share, '.4f')}" for name, share in shares)
-    return [f"  limit on the first {best['episodes']} episodes: J_a {_number(best['J_a'], '.5g')}; over it: {text}"]
 
 
 def _number(value: float | None, digits: str) -> str:

@@ -13,7 +13,6 @@ from pydantic import Field
 from torch import nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
-from rt_torchrl.evaluation.limits import LimitConfig
 from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.options import (
     AtLeastOne,
@@ -142,9 +141,7 @@ class RunConfig:
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
-            unseen episodes, and the limit of the cost.
-        limit_episodes: number of unseen episodes, the first ones, on which reference computes the clairvoyant optimum
-            and model predictive control; 0 leaves them out.
+            unseen episodes.
         figures: whether to draw figures; without them a training among many ends sooner.
         figures_every: number of episodes after which the figures are drawn into the dashboard again; they are drawn at
             the end too, and with 0 only there.
@@ -187,7 +184,6 @@ class RunConfig:
     preflight: bool = True
     untrained: Count = 20
     reference: bool = False
-    limit_episodes: Count = 8
     figures: bool = True
     figures_every: Count = 5
     unseen_every: Count = 0
@@ -209,14 +205,8 @@ class RunConfig:
                 raise ValueError(f"loggers={logger!r} needs a package that is not installed: pip install {logger}.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
-        if self.reference and self.limit_episodes and self.device != "cpu" and self.limit() is not None:
-            raise ValueError(
-                f"reference computes the limit on the CPU alone, and device={self.device!r}; give limit_episodes=0 to "
-                "leave it out."
-            )
-        if 1 in (self.limit_episodes, self.real_unseen):  # no mean of one episode has a confidence interval
-            argument = "limit_episodes" if self.limit_episodes == 1 else "real_unseen"
-            raise ValueError(f"{argument}=1 must be 0, or at least 2.")
+        if self.real_unseen == 1:  # no mean of one episode has a confidence interval
+            raise ValueError("real_unseen=1 must be 0, or at least 2.")
         if self.log != LogConfig() and self.start in STARTS:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
@@ -278,13 +268,6 @@ class RunConfig:
             return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
         except ValueError as error:
             raise ValueError(f"twinning.planner.receding_horizon: {error}") from error
-
-    def limit(self) -> LimitConfig | None:
-        """How the limit of the cost and model predictive control beside it are computed; None leaves them out.
-
-        Override this method for a plant whose limit shall be known.
-        """
-        return None
 
     def believed(self) -> Plant | None:
         """The physics of a twin that is wrong about them; None if it has those of the real system.

@@ -170,7 +170,7 @@ VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
 OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
 """Options that a file of options never gives."""
 BESIDE_TRAINING = {
-    *("figures", "figures_every", "untrained", "reference", "limit_episodes", "checkpoints", "loggers"),
+    *("figures", "figures_every", "untrained", "reference", "checkpoints", "loggers"),
     # These change a result by rounding alone.
     *("threads", "compiled"),
     *OF_THE_CALL,
