@@ -102,7 +102,7 @@ def affine(plant):
     return lambda generator: SaturatedAffine(len(plant.observations), plant.actions, generator=generator)
 
 
-def optimum(plant, policy, *, approach, iterations, polish=100, seed=1):
+def optimum(plant, policy, *, approach, iterations, polish=100, seed=2):
     episodes, effort = UnseenEpisodes(plant, EPISODES, seed=SEED), {"approach": approach, "iterations": iterations}
     return exact_optimum(episodes, policy(plant), starts=1, few=EPISODES, polish=polish, seed=seed, **effort)
 
