@@ -348,11 +348,15 @@ class Belief:
     def require_sound_twin(self, episodes: Scenario) -> None:
         """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
 
+        A twin that says e⁵ times what the last real episode cost diverges, too: nothing that it says of a plan counts.
+
         Raises:
             DivergenceError: if it does.
         """
-        if self.flown and not math.isfinite(self.virtual.cost(self.policy_of(self.flown[-1]), episodes)):
-            twin = self.virtual.twin
+        if not self.flown:
+            return
+        twin, last = self.virtual.twin, self.policy_of(self.flown[-1])
+        if self.differences()[-1] <= -DEARER or not math.isfinite(self.virtual.cost(last, episodes)):
             raise DivergenceError(
                 f"plant {twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
                 f"system; the closure is {type(twin.closure).__name__}."

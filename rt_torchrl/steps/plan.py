@@ -280,9 +280,8 @@ class MultiStart:
             found = findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
             return merged(found, self._raised(planned_on))
         present = copy.deepcopy(policy.state_dict())
+        self.belief.require_sound_twin(judged_on)
         stays = self.belief.judge(policy, judged_on)
-        if not math.isfinite(stays.price):
-            self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
         several = self._several(episode, best)
         whole = isinstance(self.planner, WholeEpisodes)
