@@ -265,7 +265,7 @@ class PredictiveControl(nn.Module):
 
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
         super().__init__()
-        self.closure, self._plant, self._config = closure, [plant], config  # in a list, it is no submodule
+        self.closure = closure
         devices = {str(weight.device) for weight in (*closure.parameters(), *closure.buffers())} - {"cpu"}
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
@@ -283,7 +283,7 @@ class PredictiveControl(nn.Module):
     @property
     def virtual_episodes(self) -> int:
         """Number of virtual episodes that it flies at a time."""
-        return self._config.virtual_episodes
+        return self._acting.config.virtual_episodes
 
     def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
@@ -291,7 +291,7 @@ class PredictiveControl(nn.Module):
         Args:
             records: inputs of whole episodes.
         """
-        plant = self._plant[0]
+        plant = self._acting.plant
         if not isinstance(self.forecast, Decaying) or not plant.inputs:
             return
         horizon = min(self._acting.horizon, records.shape[1] - 1) * plant.dt
@@ -342,7 +342,7 @@ class PredictiveControl(nn.Module):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PredictiveControl":
         # The machine code of a solve cannot be copied.
-        found = PredictiveControl(self._plant[0], copy.deepcopy(self.closure, memo), self._config)
+        found = PredictiveControl(self._acting.plant, copy.deepcopy(self.closure, memo), self._acting.config)
         found.load_state_dict(self.state_dict())
         memo[id(self)] = found
         return found
