@@ -23,14 +23,15 @@ from rt_torchrl import (
 from rt_torchrl.envs.pendulum.plant import Pendulum
 
 SWING_UP = TwinningConfig(
-    # The noise has half of the torque's range and lasts about a swing, because white noise hardly moves the rod.
-    exploration=ExplorationConfig(spread=0.5, correlation_time=0.3),
+    # The model-free policy finds the swing-up and plans improve it, because descents from random weights end in another
+    # minimum. White noise hardly moves the rod; this one fills the torque's range and lasts about a swing.
+    exploration=ExplorationConfig(spread=1.0, episodes=10, correlation_time=0.3),
     # Costs reach 16; the scale keeps values at the order of ten, which a perceptron can reach.
     learner=LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
     # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
     assimilation=AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
-    # Tiny changes decide whether a swing reaches the top: over whole episodes, descent stops in a local minimum.
-    planner=PlannerConfig(method="short_horizon", iterations=10, realisations=64),
+    # Tiny changes decide whether a swing reaches the top: a plan on few episodes says little about others.
+    planner=PlannerConfig(realisations=64),
 )
 
 

@@ -71,7 +71,6 @@ from .steps.config import (
 )
 from .steps.hypotheses.ensemble import TwinEnsemble
 from .steps.plan import Planner, RecedingHorizonPlanner, WholeEpisodes
-from .steps.short_horizon import ShortHorizon
 from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
 from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 
@@ -192,7 +191,6 @@ __all__ = [
     "Sensor",
     "SensorRecord",
     "ServerProcess",
-    "ShortHorizon",
     "Signal",
     "SmoothClip",
     "Snapshot",

@@ -117,7 +117,7 @@ class ReinforcementTwinning(TensorDictSequential):
     ):
         policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
         learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
-        planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
+        planner = planner or make_planner(twin, model_based, config.planner)
         referee = referee or make_referee(config.referee, first_live(config.arm, first))
         halves: dict[Role, Learner | Planner] = {"model_free": learner, "model_based": planner}
         for role, half in halves.items():

@@ -238,7 +238,6 @@ ONE_OF_EACH = dataclasses.replace(
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
 )
-WINDOWS = PlannerConfig(method="short_horizon", window=3, iterations=1)
 NEURAL = {"closure": "mlp", "closure_hidden": (4,), "model_free_policy": "mlp", "hidden": (4,)}
 TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
 
@@ -265,8 +264,8 @@ def train(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_real_system_short_horizon_and_td3(train):
-    assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
+def test_real_system_and_td3(train):
+    assert not train("pendulum", horizon=0.5, twinning={"learner": TD3})
 
 
 @pytest.mark.slow

@@ -16,8 +16,6 @@ from rt_torchrl import (
     PlannerConfig,
     PlantEnv,
     ReinforcementTwinning,
-    Scenario,
-    ShortHorizon,
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
@@ -176,40 +174,6 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
         if ends:  # nothing is bootstrapped
             q = values(learner, found["observation"][k : k + 1], found["action"][k : k + 1]).item()
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
-
-
-def test_windows_count_what_an_end_costs(monkeypatch):
-    plant = Falling()
-    monkeypatch.setattr(ShortHorizon, "mixing", 0.7)
-    monkeypatch.setattr(ShortHorizon, "discount", 0.9)
-    generator = torch.Generator().manual_seed(1)
-    planning = PlannerConfig(method="short_horizon", window=5)
-    plan = ShortHorizon(DigitalTwin(plant, plant.closure), LinearGain(WEAK), planning, generator=generator)
-    plan.reference = 4.0
-    costs, seen = torch.rand(2, 5, generator=generator).double(), torch.rand(2, 6, 2, generator=generator).double()
-    over = torch.tensor([[False] * 6, [False] * 3 + [True] * 3])
-    end = plant.end_cost / plan.reference
-    costs[1, 3:] = end
-    found = plan._targets(costs, seen, over)
-    torch.testing.assert_close(found[0], plan._targets(costs[:1], seen[:1], over[:1])[0])
-    v = plan.target(seen[1]).squeeze(-1)
-    last = 0.1 * costs[1, 2] + 0.9 * end  # of the interval that ends it: what follows is known
-    torch.testing.assert_close(found[1, 2:], torch.stack([last, *[torch.tensor(end).double()] * 2]).detach())
-    before = 0.1 * costs[1, 1] + 0.9 * (0.3 * v[2] + 0.7 * last)
-    torch.testing.assert_close(found[1, 1], before.detach())
-
-
-def test_plans_over_short_windows_keep_a_rod_that_would_fall(monkeypatch):
-    monkeypatch.setattr(ShortHorizon, "policy_rate", 2e-2)
-    plant = Falling()
-    planning = PlannerConfig(method="short_horizon", window=10, iterations=6)
-    policy = LinearGain(WEAK)
-    plan = ShortHorizon(DigitalTwin(plant, plant.closure), policy, planning, generator=torch.Generator().manual_seed(1))
-    start = plan.plan(Scenario(*drawn(plant, 16))).start
-    for seed in range(1, 5):
-        found = plan.plan(Scenario(*drawn(plant, 16, seed)))
-    flown = plan.twin.control(policy, *drawn(plant, 50, 99))
-    assert start > 3.0 and found.best < 0.1 * start and not plant.ended(flown.states).any()
 
 
 def algorithm(env, plant, config=SMALL, closure=None):

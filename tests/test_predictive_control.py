@@ -92,8 +92,6 @@ def test_costs_on_twin_and_unseen_episodes_are_those_of_its_flights():
     unseen = UnseenEpisodes(PLANT, 2)
     real = controller.fly(unseen.initial_state, unseen.exogenous, PLANT.closure)
     torch.testing.assert_close(unseen.control_costs(controller), control_cost(PLANT, real))
-    with pytest.raises(ValueError, match="start=0.5 of a flight by PredictiveControl must be 0"):
-        twin.control(controller, state, exogenous, start=0.5)
 
 
 class Undisturbed(LinearQuadratic):

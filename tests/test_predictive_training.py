@@ -170,10 +170,10 @@ def test_methods_and_policies_that_do_not_go_together_are_refused():
     policy, controller = plant.make_policy(generator), PredictiveControl(plant, twin.closure, PLANNER.receding_horizon)
     for given, config in ((policy, PLANNER), (controller, PlannerConfig())):
         with pytest.raises(ValueError, match="does not go with a policy of class"):
-            make_planner(twin, given, config, generator=generator)
+            make_planner(twin, given, config)
     other = PredictiveControl(plant, plant.closure, PLANNER.receding_horizon)
     with pytest.raises(ValueError, match="another closure than the twin's"):
-        make_planner(twin, other, PLANNER, generator=generator)
+        make_planner(twin, other, PLANNER)
 
 
 SHORT = {

@@ -16,7 +16,6 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
 from rt_torchrl.steps.plan import Planner, WholeEpisodes
-from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -36,9 +35,6 @@ LEARNERS = {
 }
 PLANNERS = {
     "whole episodes": lambda twin, policy: WholeEpisodes(twin, policy, PlannerConfig(iterations=2)),
-    "short horizon": lambda twin, policy: ShortHorizon(
-        twin, policy, PlannerConfig(method="short_horizon", window=10, iterations=1), generator=seeded(1)
-    ),
     "documented": lambda twin, policy: documented("planner.md", "Steps")(twin, policy),
 }
 REFEREES = {
@@ -104,9 +100,6 @@ def test_planners_improve_their_policy_on_what_they_are_given(name):
     episodes, policy = found.virtual.draw(8), found.policies["model_based"]
 
     def cost():
-        """Whole episodes descend what is expected on the real system, the others what the twin says."""
-        if name != "whole episodes":
-            return found.virtual.cost(policy, episodes)
         return found.twin.expected_costs(policy, *episodes).mean().item()
 
     before, plan, after = cost(), found.planner.plan(episodes), cost()
@@ -124,10 +117,9 @@ def test_a_learner_of_another_policy_is_refused():
 
 def test_configuration_names_the_parts():
     parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="expected_cost")}
-    short = PlannerConfig(method="short_horizon", window=10, iterations=1)
-    found = twinning(PLANT, **parts, planner=short)
+    found = twinning(PLANT, **parts)
     kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
-    assert kinds == ["ActorCritic", "ShortHorizon", "ExpectedCost"]
+    assert kinds == ["ActorCritic", "WholeEpisodes", "ExpectedCost"]
     report = found.episode()
     assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
 

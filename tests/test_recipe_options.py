@@ -295,7 +295,7 @@ CONFIGS = {
     ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
     RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "stall": math.nan},
-    PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "window": math.nan},
+    PlannerConfig: {"iterations": math.nan, "realisations": 2.5},
     LearnerConfig: {
         "critic_rate": math.inf,
         "batch_size": math.nan,

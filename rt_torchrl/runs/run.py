@@ -88,8 +88,8 @@ class Run:
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
         replay: function of ``config.twinning.learner.memory_capacity``, ``correction=`` and ``generator=`` that makes
             the memory of :class:`ActorCritic`, if there is no ``learner``.
-        planner: function of twin, policy, ``config.twinning.planner`` and ``generator=`` that makes the planner of step
-            5, a :class:`Planner`.
+        planner: function of twin, policy and ``config.twinning.planner`` that makes the planner of step 5, a
+            :class:`Planner`.
         referee: function of ``config.twinning.referee`` and the role that starts live that makes the referee of step 6,
             a :class:`Referee`.
         collector: function of the real system, the live policy and the plant that makes the TorchRL collector of step
@@ -202,7 +202,7 @@ class Run:
             config=table,
             generator=generator,
             learner=learner,
-            planner=planner(twin, policies["model_based"], table.planner, generator=generator),
+            planner=planner(twin, policies["model_based"], table.planner),
             referee=referee(table.referee, first_live(table.arm, first)),
             first=first,
             make_collector=collector,

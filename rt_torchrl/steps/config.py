@@ -117,29 +117,25 @@ class PlannerConfig:
         method: method of the model-based policy. ``multi_start`` descends the cost of whole virtual episodes from
             several starts and compares the plans (:class:`MultiStart`). ``single_start`` does what the paper does: it
             descends from the present weights, in virtual episodes that begin as the last real one did under draws of
-            its input, and keeps every plan. ``short_horizon`` descends the cost of short windows plus a learned tail
-            cost. ``receding_horizon`` is model predictive control, which has no weights of its own and plans while it
-            acts.
-        iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
-            episodes.
+            its input, and keeps every plan. ``receding_horizon`` is model predictive control, which has no weights of
+            its own and plans while it acts.
+        iterations: number n_mb of gradients per episode.
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
         starts: number of random policies, the best of which is a start of ``multi_start``; 0 plans from the present
             weights alone.
-        constraints: bounds on states that plans over whole episodes keep.
-        descent: parameters of the policy's descent over whole episodes.
-        window: number of control intervals in a window of ``short_horizon``.
+        constraints: bounds on states that plans keep.
+        descent: parameters of the policy's descent.
         receding_horizon: parameters of model predictive control.
     """
 
-    method: Literal["multi_start", "single_start", "short_horizon", "receding_horizon"] = "multi_start"
+    method: Literal["multi_start", "single_start", "receding_horizon"] = "multi_start"
     iterations: Count = 10
     realisations: AtLeastOne | None = None
     starts: Count = 32
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
-    window: AtLeastOne = 25
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     def __post_init__(self) -> None:

@@ -17,7 +17,6 @@ from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
-from rt_torchrl.steps.short_horizon import ShortHorizon
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -55,9 +54,6 @@ class Planner(Protocol):
         Raises:
             DivergenceError: if the twin diverges with the present policy.
         """
-
-    def refuse(self) -> None:
-        """React to a plan that was worse on other episodes; the policy has its earlier weights again."""
 
     def restart(self) -> None:
         """Forget everything that belongs to the policy's earlier weights, because the policy's weights have jumped."""
@@ -114,10 +110,6 @@ class WholeEpisodes:
         """Forget the state of the optimiser."""
         self.descent.restart()
 
-    def refuse(self) -> None:
-        """Forget the state of the optimiser, because it led to the plan that was refused."""
-        self.restart()
-
     def state_dict(self) -> dict[str, Any]:
         priced = {} if self.constraints is None else {"constraints": self.constraints.state_dict()}
         return self.descent.state_dict() | priced
@@ -159,8 +151,6 @@ class RecedingHorizonPlanner:
     def restart(self) -> None:
         """Do nothing: there are no weights, and the controller plans on the closure as it is."""
 
-    refuse = restart
-
     def state_dict(self) -> dict[str, Any]:
         """Nothing: the forecast belongs to the controller."""
         return {}
@@ -169,14 +159,13 @@ class RecedingHorizonPlanner:
         """Do nothing."""
 
 
-def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator) -> Planner:
+def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig) -> Planner:
     """The planner of a configuration; see :class:`PlannerConfig` for the methods.
 
     Args:
         twin: twin on which the policy is planned.
         policy: policy π_mb, updated in place.
         config: parameters of step 5.
-        generator: source of the initial weights of a short horizon's critic.
 
     Raises:
         ValueError: if the method is receding_horizon and the policy is not :class:`PredictiveControl`, or the other way
@@ -189,12 +178,10 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
         )
     if isinstance(policy, PredictiveControl):
         return RecedingHorizonPlanner(twin, policy, config)
-    if config.method == "short_horizon":
-        return ShortHorizon(twin, policy, config, generator=generator)
     return WholeEpisodes(twin, policy, config)
 
 
-MakePlanner = Callable[..., Planner]
+MakePlanner = Callable[[DigitalTwin, nn.Module, PlannerConfig], Planner]
 """Function that makes the planner of step 5; :func:`make_planner` describes the arguments."""
 
 
@@ -333,7 +320,7 @@ class MultiStart:
             if cost <= stays and math.isfinite(cost.price):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
             policy.load_state_dict(present)
-            self.planner.refuse()
+            self.planner.restart()
             if not len(self.virtual.extremes) or cost.price > stays.price:
                 break
             episodes = self.virtual.with_extremes(planned_on)

@@ -122,22 +122,15 @@ class DigitalTwin:
         require_finite(self.plant, ends, start, [self.closure])
         return torch.cat([start, ends[:, 0]])
 
-    def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, *, start: Start = 0.0) -> Trajectory:
-        """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
+    def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Trajectory:
+        """Virtual episodes under a policy; see :meth:`Rollout.__call__`.
 
         The trajectory is differentiable by the policy's weights and the initial state; the closure is held constant.
-        That of state feedback is not differentiable, and begins with an episode.
-
-        Raises:
-            ValueError: if state feedback is to fly a part of an episode.
+        That of state feedback is not differentiable.
         """
         if isinstance(policy, StateFeedback):
-            if isinstance(start, Tensor) or start != 0.0:
-                raise ValueError(
-                    f"start={start} of a flight by {type(policy).__name__} must be 0, as it plans from there."
-                )
             return policy.fly(initial_state, exogenous, self.closure, plant=self.plant)
-        return self._planning(policy)(initial_state, exogenous, start=start)
+        return self._planning(policy)(initial_state, exogenous)
 
     def cost(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""

@@ -130,16 +130,11 @@ class TwinEnsemble(DigitalTwin):
         self.weights = {ALONE: 1.0}
 
     def control(
-        self,
-        policy: nn.Module,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Trajectory:
         """Virtual episodes under the likeliest hypothesis, as sensors read them; see :meth:`DigitalTwin.control`."""
         twin = self.believed
-        flown = twin.control(policy, twin.plant.at_rest(initial_state), exogenous, start=start)
+        flown = twin.control(policy, twin.plant.at_rest(initial_state), exogenous)
         return flown._replace(states=flown.states[..., : len(self.plant.states)])
 
     def episode_costs(
