@@ -125,6 +125,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
         for command in rest
         if re.fullmatch(r"uv run --group nightly tests/peers\.py \w+( --[a-z]+ \d+)*", command)
     }
+    known |= {command for command in rest if command.startswith("uv run --extra rosco tests/rosco_peer.py ")}  # an hour
     known |= {"uv run --extra tank docs/gallery.py"}  # tests/test_documentation.py
     known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
     known |= {f"{PYTEST} -m faults"}

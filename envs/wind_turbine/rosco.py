@@ -257,27 +257,35 @@ class RoscoController(RealController):
 
             with silenced():
                 simulate(plant, seed, lambda start, wind: Answer(plant, start, wind.repeat(every), decide, 1))
-                # The Fortran runtime would otherwise write its buffers to the terminal after this context.
-                if hasattr(interface.discon, "_gfortran_flush_i4"):
-                    interface.discon._gfortran_flush_i4(None)
-                interface.kill_discon()
+                unload(interface)
         wind = torch.tensor(winds[::every][:-1], dtype=torch.float64)
         return torch.stack(states[::every]), torch.stack(applied[::every])[:-1], wind
 
 
-def controller_interface(folder: Path) -> Any:
+def controller_interface(folder: Path, **tuning: float) -> Any:
     """ROSCO's controller with ROSCO's tuning, and with its inputs and logs in a folder.
 
     The controller measures the wind and does not estimate it, because ROSCO's simulator is known to upset
     the estimators.
+
+    Args:
+        folder: folder of the inputs and logs.
+        tuning: parameters of ROSCO's tuning that replace its own, such as ``PS_Mode=0`` for no limit of the thrust.
     """
     toolbox, path = rosco().toolbox, str(folder / "DISCON.IN")
     with silenced():
         controller = toolbox.controller.Controller(
-            parameters()["controller_params"] | {"WE_Mode": 0, "LoggingLevel": 0}
+            parameters()["controller_params"] | {"WE_Mode": 0, "LoggingLevel": 0} | tuning
         )
         controller.tune_controller(nrel5mw())
         toolbox.utilities.write_DISCON(nrel5mw(), controller, param_file=path, txt_filename=nrel5mw().table)
         return toolbox.control_interface.ControllerInterface(
             rosco().discon_lib_path, param_filename=path, sim_name=str(folder / "rosco"), DT=STEP
         )
+
+
+def unload(interface: Any) -> None:
+    """Unload ROSCO's controller, and have its Fortran runtime write its buffers now and not later."""
+    if hasattr(interface.discon, "_gfortran_flush_i4"):
+        interface.discon._gfortran_flush_i4(None)
+    interface.kill_discon()
