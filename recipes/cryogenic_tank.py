@@ -109,10 +109,8 @@ class Config(RunConfig):
         end_weight: weight in J_a of the squared pressure error at the end of an episode, as the time [s] for which that
             error would cost as much, by default 12 h; 0 is the paper's J_a, whose optimum stops venting 12 h before the
             end.
-        dt: control interval [s].
         horizon: length of an episode T_o [s].
         fluid: name in CoolProp of the pure fluid in the tank.
-        wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
             twinning.assimilation.initial is estimated.
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
@@ -128,10 +126,8 @@ class Config(RunConfig):
     vented_weight: float = 5000.0
     end_weight: float = 43.2e3
     closure: Literal["paper", "mlp"] = "paper"
-    dt: float = 30.0
     horizon: float = 4.32e5
     fluid: str = "Hydrogen"
-    wall_heat_capacity: float = 500e3
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
@@ -175,10 +171,8 @@ class Config(RunConfig):
     def tank(self) -> CryogenicTank:
         """The tank as its twin knows it."""
         return CryogenicTank(
-            dt=self.dt,
             horizon=self.horizon,
             fluid=self.fluid,
-            wall_heat_capacity=self.wall_heat_capacity,
             cost=self.cost(),
             command=self.command,
             observe=self.observe,

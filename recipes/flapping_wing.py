@@ -3,9 +3,7 @@
 import dataclasses
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading, configuration
 
@@ -30,7 +28,6 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
@@ -112,8 +109,6 @@ MASS, BELIEVED = 3e-3, 2.25e-3
 """Mass of the body [kg], and the mass that the twin believes with ``--model-error``."""
 TARGETS = {"paper": (5.0, 5.0), "hop": (1.0, 1.0)}
 """Target (x_f, z_f) of each task [m]."""
-STORM = 120.0
-"""Wind speed above all that has been measured near the ground [m/s]."""
 
 
 @configuration
@@ -126,10 +121,7 @@ class Config(RunConfig):
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
             these), or names such as headwind; by default measured+wind for mlp, and else paper.
         task: where the drone flies to: paper (5 m forwards and upwards), or hop (1 m forwards and upwards).
-        dt: control interval [s].
         horizon: length of an episode T_o [s].
-        mean_wind: mean headwind [m/s].
-        wind_deviation: standard deviation of the headwind [m/s].
         peak: height of the window of J_a around the target: unit, or printed as in the paper.
         energy: weight in J_a of the power of the wings.
         tilt: weight in J_a of the rate of the stroke plane, in (1000 deg/s)².
@@ -145,10 +137,7 @@ class Config(RunConfig):
     start: Text = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     task: Literal["paper", "hop"] = "paper"
-    dt: float = 5e-4
     horizon: float = 5.0
-    mean_wind: Annotated[float, Field(ge=-STORM, le=STORM)] = 1.0
-    wind_deviation: Annotated[float, Field(ge=0, le=STORM)] = 1.0
     observe: tuple[str, ...] = ()
     peak: Literal["unit", "printed"] = "unit"
     energy: float = 0.0
@@ -180,11 +169,8 @@ class Config(RunConfig):
 
     def drone(self, mass: float) -> FlappingWing:
         """The drone as its twin knows it, with a body of this mass [kg]."""
-        wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
         return FlappingWing(
-            dt=self.dt,
             horizon=self.horizon,
-            wind=wind,
             target=TARGETS[self.task],
             cost=self.cost(),
             mass=mass,

@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import field
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 from rt_torchrl import begin_loading, configuration
 
@@ -42,22 +42,14 @@ class Config(RunConfig):
     Args:
         policy: plant (the plant's own perceptron of cos θ, sin θ and dθ/dt) or mlp.
         horizon: length of an episode T_o [s]; Gymnasium's is 10.
-        gravity: gravity g [m/s²].
-        guess: share of the true mass and length that the twin starts from.
-        judged_on: system on which policies are judged: real for the twin and, in as many episodes of the live policy as
-            unseen says unless real_unseen does, Gymnasium's pendulum; or plant for this library's pendulum with
-            Gymnasium's mass and length, which is quicker and which --reference needs.
     """
 
     episodes: int = 10
     horizon: float = 10.0
-    gravity: float = 10.0
-    guess: float = 0.5
-    judged_on: Literal["real", "plant"] = "real"
     twinning: TwinningConfig = field(default_factory=lambda: SWING_UP)
 
     def plant(self) -> Pendulum:
-        return Pendulum(horizon=self.horizon, gravity=self.gravity, guess=self.guess)
+        return Pendulum(horizon=self.horizon)
 
 
 def main(config: Config, **parts: Any) -> None:
@@ -66,12 +58,11 @@ def main(config: Config, **parts: Any) -> None:
     from rt_torchrl import Run
     from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 
-    if config.judged_on == "real" and not config.real_unseen:
+    if not config.real_unseen:  # a simulator may fly
         config = dataclasses.replace(config, real_unseen=config.unseen)
     plant = config.plant()
-    known = plant.closure if config.judged_on == "plant" else None
     device = require_device(config.device)
-    env = partial(gymnasium_pendulum, plant, seed=config.seed, closure=known, device=device)
+    env = partial(gymnasium_pendulum, plant, seed=config.seed, device=device)
     Run(config, plant, env=env, **parts).train()
 
 

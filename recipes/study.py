@@ -39,7 +39,7 @@ PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
 ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
 OWN = ("--seed", "--log-dir", "--resume", "--overwrite", "--threads", "--unseen-every", "--config")
 """Options that the study gives every run itself."""
-EVERY = ("--threads", "1", "--unseen-every", "1", "--untrained", "0", "--figures-every", "0", "--no-figures")
+EVERY = ("--threads", "1", "--unseen-every", "1", "--no-figures")
 QUICK_EFFORT = {"starts": 1, "approach": 100, "iterations": 20, "polish": 5}
 """Effort of the search for the optimum with ``quick``."""
 
@@ -195,10 +195,7 @@ class Training:
                 f"{self.folder} holds a run of other options: {'; '.join(found)}. Give its options or another log_dir, "
                 "or remove the folder."
             )
-        if metrics is None or done == wanted:
-            return metrics is not None
-        patient = read_settings(self.folder)["patience"] == asked.patience  # another patience may go on
-        return patient and metrics["summary"].get("ended") is not None
+        return metrics is not None and (done == wanted or metrics["summary"].get("ended") is not None)
 
     def run(self) -> None:
         """Train, or go on with what is there. ``training.log`` in the folder takes all output, and a traceback."""

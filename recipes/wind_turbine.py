@@ -5,9 +5,7 @@ from collections.abc import Callable
 from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading, configuration
 
@@ -33,12 +31,12 @@ from rt_torchrl import (
     require_device,
 )
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
-from rt_torchrl.envs.wind_turbine.disturbances import STORM, KaimalWind, RecordedWind
+from rt_torchrl.envs.wind_turbine.disturbances import RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
-from rt_torchrl.options import Share, Text
+from rt_torchrl.options import NotNegative, Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,11 +93,9 @@ class Config(RunConfig):
             rotor_speed; by default measured+wind for mlp, scheduled for scheduled, and else paper.
         task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
             overspeed, overshoot, and the rates of pitch and torque).
-        engineering: weights of the task engineering.
+        pitch_rate_weight: weight w_β of the rate of pitch in the cost of the task engineering.
         dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
-        mean_wind: mean wind speed U [m/s].
-        turbulence: turbulence intensity σ/U [-].
         wind_files: TurbSim files (.hh or .bts) from which the wind is drawn instead.
         model_error: wear the rotor from the middle of the training on, with 10 % less lift and 50 % more drag.
         unknown: what the real system has beside its twin, one or more of anemometer_low, anemometer_high, torque_loss,
@@ -115,11 +111,9 @@ class Config(RunConfig):
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
-    engineering: EngineeringCost = field(default_factory=EngineeringCost)
+    pitch_rate_weight: NotNegative = 0.01
     dt: float = 0.5
     horizon: float = 600.0
-    mean_wind: Annotated[float, Field(gt=0, le=STORM)] = 11.0
-    turbulence: Share = 0.16
     wind_files: tuple[Path, ...] = ()
     model_error: bool = False
     unknown: tuple[str, ...] = ()
@@ -128,8 +122,8 @@ class Config(RunConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.task == "paper" and self.engineering != EngineeringCost():
-            raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
+        if self.task == "paper" and self.pitch_rate_weight != type(self).pitch_rate_weight:
+            raise ValueError("pitch_rate_weight is one of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
         require_unknown(self.unknown)
         if self.unknown and (self.model_error or self.real == "rosco"):
@@ -156,14 +150,14 @@ class Config(RunConfig):
 
     def turbine(self) -> WindTurbine:
         """The turbine as its twin knows it."""
-        wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
+        wind = None
         if self.wind_files:
             try:
                 wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
             except (ValueError, OSError) as error:
                 raise ValueError(f"wind_files: {error}") from error
         usual = "paper" if self.preset == "paper" and self.policy == "mlp" else OBSERVED[self.policy]
-        cost = self.engineering if self.task == "engineering" else PaperCost()
+        cost = EngineeringCost(pitch_rate=self.pitch_rate_weight) if self.task == "engineering" else PaperCost()
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:

@@ -81,7 +81,7 @@ from .runs.compare import Comparison, compare_runs
 from .runs.diagnosis import Reason, diagnose
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run
-from .runs.run_config import EarlyStopping, Preset, RunConfig, require_device
+from .runs.run_config import Preset, RunConfig, require_device
 from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
@@ -114,7 +114,6 @@ __all__ = [
     "DigitalTwin",
     "DivergenceError",
     "EarlierPolicies",
-    "EarlyStopping",
     "Engine",
     "EpisodeAbandoned",
     "Estimate",

@@ -19,7 +19,7 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 
 EPISODES = 5
-QUICK = {"figures": False, "untrained": 0}
+QUICK = {"figures": False}
 SHIPPED = {
     "wind_turbine": (lambda: WindTurbine(horizon=30.0), JonkmanController),
     "flapping_wing": (lambda: FlappingWing(dt=0.002, horizon=0.12), TrimmedPD),

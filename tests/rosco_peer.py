@@ -117,7 +117,7 @@ def trained(options, seed, folder):
     if not (run / "metrics.json").exists():
         run.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(RECIPE), "--task", "engineering", "--seed", str(seed), "--threads", "1"]
-        command += ["--no-figures", "--figures-every", "0", "--untrained", "0", "--log-dir", str(run), "--overwrite"]
+        command += ["--no-figures", "--log-dir", str(run), "--overwrite"]
         with (folder / "training.log").open("w") as log:
             subprocess.run([*command, *shlex.split(options)], check=True, stdout=log, stderr=log)
     return run

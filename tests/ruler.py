@@ -51,7 +51,7 @@ def train(row: Row, seed: int, folder: Path) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(RECIPES / f"{row.recipe}.py"), "--seed", str(seed), "--threads", "1"]
-    command += ["--no-figures", "--figures-every", "0", "--untrained", "0", "--log-dir", str(folder), *row.options]
+    command += ["--no-figures", "--log-dir", str(folder), *row.options]
     start = time.perf_counter()
     with (folder / "training.log").open("w") as log:
         subprocess.run([*command, "--overwrite"], check=True, stdout=log, stderr=log)

@@ -19,7 +19,6 @@ class Config(RunConfig):
 
     episodes: int = 1
     unseen: int = 3
-    untrained: int = 0
     figures: bool = False
     horizon: float = 2.0
     twinning: TwinningConfig = field(default_factory=lambda: SMALL)

@@ -39,6 +39,6 @@ def stepped_cost(episodes, policy):
 
 def small_run(folder, episodes=3, plant=None, *, config=RunConfig, parts=None, **options):
     """A run of a plant under some options; ``parts`` are further arguments of the run."""
-    options = {"compiled": False, "unseen": 3, "figures": False, "figures_every": 0, "twinning": SMALL} | options
+    options = {"unseen": 3, "figures": False, "twinning": SMALL} | options
     made = config(episodes=episodes, log_dir=folder, **options)
     return Run(made, plant or LinearQuadratic(horizon=2.0), **parts or {})

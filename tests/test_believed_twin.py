@@ -43,7 +43,7 @@ def run(tmp_path_factory):
     assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
     hypotheses = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
-    options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
+    options = {"unseen": 3, "figures": False}
     config = Config(episodes=1, log_dir=folder, twinning=twinning, **options)
     Run(config, config.plant(), believed=config.believed()).train()
     return load_run(folder, Config)

@@ -93,7 +93,7 @@ def test_without_a_policy_that_may_act_the_training_says_so():
 def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
     def run(folder, **options):
         twinning = dataclasses.replace(SMALL, limits=dataclasses.replace(LIMITS, tolerated=0.9))
-        shared = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False}
+        shared = {"unseen": 2, "figures": False}
         config = RunConfig(log_dir=folder, twinning=twinning, **shared, **options)
         assert read_options(RunConfig, as_written(config) | {"log_dir": None, "resume": False}).twinning == twinning
         return Run(config, LinearQuadratic(horizon=2.0))

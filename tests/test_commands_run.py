@@ -23,7 +23,7 @@ TRAININGS = [
     for command in commands()
     if re.search(r"recipes/(wind_turbine|pendulum)\.py", command) and "--help" not in command
 ]
-LAST = "uv run recipes/wind_turbine.py --episodes 1 --unseen 2 --quick --horizon 20 --compiled False --log-dir "
+LAST = "uv run recipes/wind_turbine.py --episodes 1 --unseen 2 --quick --horizon 20 --log-dir "
 PATIENCE = 300.0  # [s] for what takes seconds on a quiet machine
 
 

@@ -50,9 +50,7 @@ class Config(RunConfig):
     policy: Literal["full", "spring"] = "full"
     episodes: int = 2
     unseen: int = 4
-    untrained: int = 0
     figures: bool = False
-    compiled: bool = False
     twinning: TwinningConfig = field(
         default_factory=lambda: TwinningConfig(
             arm="model_based",

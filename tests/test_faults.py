@@ -145,9 +145,7 @@ def test_the_first_episode_is_whole():
 @pytest.mark.parametrize("figures", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     plant = LinearQuadratic(horizon=DT * N)
-    config = RunConfig(
-        episodes=3, log_dir=tmp_path, compiled=False, unseen=2, untrained=0, figures=figures, twinning=SMALL
-    )
+    config = RunConfig(episodes=3, log_dir=tmp_path, unseen=2, figures=figures, twinning=SMALL)
     system = guarded(Injection("nan", 8, 10), Injection("raises", 30, episode=2), plant=plant)
     states, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
     run = Run(config, plant, env=RealSystem(system, plant, state=states, exogenous=exogenous, applied=applied))

@@ -85,7 +85,7 @@ def test_a_policy_that_cannot_imitate_is_planned_before_it_flies(monkeypatch):
 
 
 def run(folder, **options):
-    return small_run(folder, 2, untrained=0, parts={"first": PD}, **options)
+    return small_run(folder, 2, parts={"first": PD}, **options)
 
 
 def test_a_run_begins_with_the_controller_once(tmp_path):

@@ -229,7 +229,7 @@ def test_an_fmu_that_cannot_be_written_is_refused_before_the_work(tmp_path, monk
 
 
 OPTIONS = (
-    *("--horizon", "60", "--episodes", "2", "--unseen", "3", "--untrained", "0", "--no-figures", "--threads", "1"),
+    *("--horizon", "60", "--episodes", "2", "--unseen", "3", "--no-figures", "--threads", "1"),
     *("--twinning.learner.critic-iterations", "30", "--twinning.learner.actor-iterations", "30"),
     # L-BFGS makes per cents of the last digit in some tens of steps; these two methods do not.
     *("--twinning.assimilation.method", "levenberg_marquardt", "--twinning.assimilation.iterations", "10"),

@@ -51,7 +51,7 @@ def test_the_weights_are_those_of_the_real_system_after_two_and_three_episodes(t
     """The classical controller flies the first of them; the twin has the true form, and sensors have no noise."""
     fitted = ["--twinning.assimilation.inputs", "record", "--twinning.assimilation.method", "levenberg_marquardt"]
     fitted += ["--twinning.arm", "model_based", "--twinning.hypotheses.which", "none", *words]
-    short = ["--episodes", str(episodes), "--unseen", "2", "--untrained", "0", "--no-figures", "--threads", "1"]
+    short = ["--episodes", str(episodes), "--unseen", "2", "--no-figures", "--threads", "1"]
     recipe = load_recipe(RECIPES / f"{name}.py")
     recipe.main(from_command_line(recipe.Config, [*short, *fitted, "--log-dir", str(tmp_path)]))
     laws = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]

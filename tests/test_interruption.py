@@ -15,7 +15,7 @@ from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.steps.learn import ActorCritic
 
 EPISODES = 4
-QUICK = {"figures": False, "untrained": 0}
+QUICK = {"figures": False}
 
 
 def press():

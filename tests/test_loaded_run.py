@@ -49,7 +49,7 @@ def combinations():
 
 @pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
 def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, other, tmp_path):
-    options = {"policy": policy, "closure": closure, "model_free_policy": other, "hidden": (3,), "closure_hidden": (2,)}
+    options = {"policy": policy, "closure": closure, "model_free_policy": other, "hidden": (3,)}
     options |= {"horizon": 3000.0} | ({} if plant == "pendulum" else {"model_error": True})
     config, parts = leave_run(tmp_path, plant, **options)
     run = load_run(tmp_path)
@@ -78,7 +78,7 @@ CHOICES = {
 )
 def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path, monkeypatch):
     made, drawn = load_recipe(RECIPES / f"{plant}.py"), plant == "wind_turbine"
-    small = {"episodes": 1, "unseen": 2, "untrained": 0, "figures": drawn, "figures_every": 0, "twinning": SMALL}
+    small = {"episodes": 1, "unseen": 2, "figures": drawn, "twinning": SMALL}
     config = made.Config(**CHOICES[plant], **small, policy="mlp", hidden=(3,), log_dir=tmp_path)
     # A hundred frames of a flight show nothing of its settings.
     monkeypatch.setattr(made, "animate", None, raising=False)
@@ -287,7 +287,7 @@ class Worn(RunConfig):
 def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start, monkeypatch):
     """The flight of the controller and a refused one wear the system, too; episodes that were not made do not."""
     parts = {"first": PD, "callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
-    run = small_run(tmp_path, 5, config=Worn, parts=parts, untrained=0, start=start)
+    run = small_run(tmp_path, 5, config=Worn, parts=parts, start=start)
     refused = SoundPart([], [], "refused by the test", whole=False)
     answers = [*(start == "controller") * [None], None, refused, None]
     monkeypatch.setattr(interact, "sound_part", lambda *given: answers.pop(0) or sound_part(*given))
@@ -298,7 +298,7 @@ def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start, mo
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     hypotheses = dataclasses.replace(SMALL, hypotheses=HypothesesConfig(call=0.0))
-    run = small_run(tmp_path, 1, Suspecting(horizon=2.0), untrained=0, twinning=hypotheses)
+    run = small_run(tmp_path, 1, Suspecting(horizon=2.0), twinning=hypotheses)
     run.train()
     trained = run.algorithm.twin
     loaded = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0))

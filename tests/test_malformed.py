@@ -253,7 +253,7 @@ def test_a_damaged_file_is_refused_or_sound(name, examples, tmp_path):
 
 NUMBERS = (math.nan, math.inf, -math.inf, -1, 0, -1e308, 1e308, 2.5)
 OTHERS = ("x", "", None, [], {}, True, (1.0, 2.0, 3.0), object())
-TIMES = "interval deadline hold patience correlation_time gap period dt horizon clock_tolerance".split()
+TIMES = "interval deadline hold correlation_time gap period dt horizon".split()
 """Arguments in seconds, which are never negative."""
 
 
@@ -306,7 +306,7 @@ CONSTRUCTORS = [
     (Reading, {"scale": 1.0, "offset": 0.0}),
     (Actuation, {"scale": 1.0, "offset": 0.0}),
     (lambda **o: Signal(symbol="x", name="x", unit="m", **o), {"low": -1.0, "high": 1.0}),
-    (lambda **o: SafetyConfig(interval=0.1, **o), {"deadline": 1.0, "hold": 1.0, "patience": 1.0}),
+    (lambda **o: SafetyConfig(interval=0.1, **o), {"deadline": 1.0, "hold": 1.0}),
     (
         lambda **o: ActionLimits(SPEC, SafetyConfig(**o)),
         {"interval": 0.1, "low": (-1.0,), "high": (1.0,), "rates": (1.0,)},

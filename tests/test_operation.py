@@ -5,6 +5,7 @@ import json
 import math
 import multiprocessing
 import os
+from unittest import mock
 
 import pytest
 import test_algorithm
@@ -15,12 +16,14 @@ from small_runs import SMALL, small_run
 from test_faults import require_true
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.runs import real_side
 from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.systems.operation import operator
 from rt_torchrl.systems.operation.operator import Crew, SimulatedOperation
 from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.real_system import Reading, RealSystem
@@ -115,10 +118,10 @@ class Constant(torch.nn.Module):
         return self.values.expand(*observation.shape[:-1], -1)
 
 
-def handed_over(plant, before, after, at, *, handover=20):
+def handed_over(plant, before, after, at):
     """The commands of a window in which one constant policy takes over from another one."""
     policies = {"before": before, "after": after}
-    operation = operation_of(learning=at - plant.n_steps, handover=handover)(plant, policies, QUIET)
+    operation = operation_of(learning=at - plant.n_steps)(plant, policies, QUIET)
     operation.hand_over("before", before, strength=0.0)
     operation.rollout()
     operation.hand_over("after", after, strength=0.0)
@@ -134,10 +137,11 @@ def test_the_action_fades_from_one_policy_to_the_next():
     assert window["version"].flatten().tolist() == [0] * 10 + [1] * 40
 
 
-def test_the_handover_keeps_the_actuators_own_rate():
+def test_the_handover_keeps_the_actuators_own_rate(monkeypatch):
     """Torque and pitch of the turbine move by 7500 N m and 4 deg in an interval of half a second."""
     plant = WindTurbine(horizon=30.0)
-    window = handed_over(plant, Constant(4e4, 20.0), Constant(1e4, 0.0), 65, handover=1)
+    monkeypatch.setattr(operator, "HANDOVER", 1)
+    window = handed_over(plant, Constant(4e4, 20.0), Constant(1e4, 0.0), 65)
     action, applied = window["action"], window["next", "applied"]
     steps = action.diff(dim=0).abs().max(0).values
     assert steps[0] <= 7500.0 + 1e-6 and steps[1] <= 4.0 + 1e-9
@@ -145,9 +149,7 @@ def test_the_handover_keeps_the_actuators_own_rate():
     torch.testing.assert_close(applied[20:], action[20:])
 
 
-@pytest.mark.parametrize(
-    "options", [{"learning": -0.1}, {"learning": math.nan}, {"speed": 0.0}, {"speed": math.inf}, {"handover": 0}]
-)
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"speed": math.inf}, {"clock": "sun"}])
 def test_impossible_options_are_refused(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}="):
         OperationConfig(**options)
@@ -171,11 +173,12 @@ def machine(injections=()):
     return RealSystem(layer, PLANT, state=state, exogenous=exogenous, applied=applied, closure=PLANT.closure)
 
 
-def operated(folder, env=None, episodes=3, limits=None, twinning=SMALL, **options):
+def operated(folder, env=None, episodes=3, limits=None, twinning=SMALL, learning=0.5, **options):
     twinning = twinning if limits is None else dataclasses.replace(twinning, limits=limits)
-    shared = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False, "asynchronous": True}
+    shared = {"unseen": 2, "figures": False, "asynchronous": True}
     config = RunConfig(log_dir=folder, episodes=episodes, twinning=twinning, **shared | options)
-    return Run(config, PLANT, env=env)
+    with mock.patch.object(real_side, "LEARNING", learning):
+        return Run(config, PLANT, env=env)
 
 
 def without_time(records):
@@ -184,7 +187,7 @@ def without_time(records):
 
 @pytest.mark.parametrize("continuous", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_limits_are_held_predicted_and_counted_and_go_on_after_a_stop(tmp_path, continuous):
-    options = {"limits": LIMITS, "operation": OperationConfig(continuous=continuous, learning=1.4)}
+    options = {"limits": LIMITS, "operation": OperationConfig(continuous=continuous), "learning": 1.4}
     run = operated(tmp_path / "whole", episodes=4, **options)
     whole = run.train()["episodes"]
     assert "predicted_violations" in whole[-1] and "predicted_violations" not in whole[0]
@@ -210,8 +213,8 @@ def test_limits_are_held_predicted_and_counted_and_go_on_after_a_stop(tmp_path, 
     ids=lambda value: getattr(value, "kind", None),
 )
 def test_a_fault_costs_its_own_intervals_alone(tmp_path, injection, kind, kept, continuous):
-    operation = OperationConfig(continuous=continuous, learning=0.0)
-    run = operated(tmp_path, machine([injection]), operation=operation)
+    operation = OperationConfig(continuous=continuous)
+    run = operated(tmp_path, machine([injection]), learning=0.0, operation=operation)
     algorithm = run.algorithm
     found, stored = [], []
     for _ in range(3):
@@ -227,7 +230,8 @@ def test_a_fault_costs_its_own_intervals_alone(tmp_path, injection, kind, kept, 
 
 def test_a_reading_refused_at_the_end_of_a_window_is_not_the_start_of_the_next(tmp_path):
     """Where nothing is reset, the last reading of a window is the first one of the next."""
-    run = operated(tmp_path, machine([Injection("nan", 29)]), operation=OperationConfig(continuous=True, learning=0.0))
+    operation = OperationConfig(continuous=True)
+    run = operated(tmp_path, machine([Injection("nan", 29)]), learning=0.0, operation=operation)
     stored = []
     for _ in range(3):
         run.algorithm.episode()

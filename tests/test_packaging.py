@@ -324,7 +324,7 @@ def until_checkpoint(path, content):
 atomic_file.write_atomically = until_checkpoint
 folder, *recipes = sys.argv[1:]
 for path in recipes:
-    sys.argv = [path, "--quick", "--figures-every", "2", "--threads", "1", "--log-dir", f"{folder}/{len(path)}"]
+    sys.argv = [path, "--quick", "--threads", "1", "--log-dir", f"{folder}/{len(path)}"]
     if "flapping_wing" not in path:  # one learns from a controller, which takes longer than its first episode
         sys.argv += ["--start", "random"]
     try:

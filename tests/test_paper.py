@@ -14,7 +14,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 SHORT = {"wind_turbine": 20.0, "flapping_wing": 0.05, "cryogenic_tank": 3000.0}
 PLANTS = ["wind_turbine", *(pytest.param(name, marks=pytest.mark.slow) for name in SHORT if name != "wind_turbine")]
 ITERATIONS = ("--twinning.learner.critic-iterations", "70", "--twinning.learner.actor-iterations", "60")
-WORDS = ("--preset", "paper", "--seed", "3", "--unseen", "2", "--untrained", "0", "--no-figures", *ITERATIONS)
+WORDS = ("--preset", "paper", "--seed", "3", "--unseen", "2", "--no-figures", *ITERATIONS)
 REFEREE = ("--twinning.referee.patience", "0", "--twinning.referee.clone-patience", "0")
 
 
@@ -44,7 +44,7 @@ def test_it_is_one_screen_with_three_options():
 @pytest.mark.parametrize("plant", PLANTS)
 def test_the_figures_of_the_paper_are_drawn_beside_its_numbers(plant, tmp_path, monkeypatch, capsys):
     recipe = module_of(RECIPES / "paper_figures.py")
-    short = ("--horizon", str(SHORT[plant]), "--episodes", "2", "--unseen", "3", "--untrained", "0", *ITERATIONS)
+    short = ("--horizon", str(SHORT[plant]), "--episodes", "2", "--unseen", "3", *ITERATIONS)
     monkeypatch.setattr(recipe, "OPTIONS", (*recipe.OPTIONS, *short))
     recipe.main(recipe.Config(plant=plant, seeds=(0, 1), jobs=1, log_dir=tmp_path))
     said = capsys.readouterr().out

@@ -391,7 +391,6 @@ def test_results_say_how_often_and_how_far(tmp_path, capsys):
     config = RunConfig(
         episodes=2,
         log_dir=tmp_path,
-        compiled=False,
         unseen=3,
         figures=False,
         twinning=dataclasses.replace(SMALL, planner=planner),

@@ -24,7 +24,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2))
+PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
 
 
@@ -37,8 +37,8 @@ class Config(RunConfig):
 
 def training(folder=None, episodes=3, *, twinning=None, **options):
     chosen = dataclasses.replace(SMALL, **({"planner": PLANNER, "assimilation": FIT} | (twinning or {})))
-    options = {"figures": False, "untrained": 0, "unseen": 2, "figures_every": 0} | options
-    config = Config(episodes=episodes, log_dir=folder, compiled=False, twinning=chosen, **options)
+    options = {"figures": False, "unseen": 2} | options
+    config = Config(episodes=episodes, log_dir=folder, twinning=chosen, **options)
     return Run(config, config.plant())
 
 
@@ -185,8 +185,8 @@ SHORT = {
     "cryogenic_tank": ["--horizon", "7200", "--twinning.learner.return-steps", "1", "--command", "duty"],
 }
 ALWAYS = (
-    "--quick --untrained 0 --no-figures --threads 1 --twinning.planner.method receding_horizon "
-    "--twinning.referee.patience 0 --twinning.planner.receding-horizon.virtual-episodes 1 "
+    "--quick --no-figures --threads 1 --twinning.planner.method receding_horizon "
+    "--twinning.referee.patience 0 "
     "--twinning.learner.critic-iterations 5 --twinning.learner.actor-iterations 5"
 ).split()
 

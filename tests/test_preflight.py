@@ -291,9 +291,7 @@ def test_the_controller_that_flies_first_may_act():
 @pytest.mark.parametrize("mended", [False, True])
 def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_learns(tmp_path, mended):
     system = wired(PENDULUM, sent=None if mended else (-1.0, 0.0))
-    config = RunConfig(
-        log_dir=tmp_path, episodes=1, unseen=2, untrained=0, figures=False, twinning=SMALL, compiled=False
-    )
+    config = RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
     run = Run(config, PENDULUM, env=system)
     if mended:
         assert len(run.train()["episodes"]) == 1
@@ -308,9 +306,7 @@ def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_
 
 
 def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
-    config = RunConfig(
-        log_dir=tmp_path, episodes=1, unseen=2, untrained=0, figures=False, twinning=SMALL, compiled=False
-    )
+    config = RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
     with pytest.warns(UserWarning, match="the twin leaves"):
         metrics = Run(config, PENDULUM, env=wired(PENDULUM, noise=0.5)).train()
     (doubt,) = metrics["episodes"][0]["doubts"]

@@ -53,10 +53,8 @@ class Machine(Rig):
         return told
 
 
-def run_on(
-    machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=SMALL, untrained=2, **options
-):
-    own = {"compiled": False, "episodes": 2, "unseen": 3, "figures": False, "untrained": untrained}
+def run_on(machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=SMALL, **options):
+    own = {"episodes": 2, "unseen": 3, "figures": False}
     config = RunConfig(log_dir=folder, twinning=twinning, **own | options)
     plant = machine.inner.plant
     given = {"baselines": baselines, "first": first, "callbacks": callbacks}
@@ -332,15 +330,6 @@ def test_an_environment_that_terminates_is_refused_with_what_to_do():
         found.episode()
 
 
-def test_a_layer_that_loses_patience_is_refused_with_what_to_do():
-    """The layer's shutdown truncates the episode, which then is not whole."""
-    plant = LinearQuadratic(horizon=HORIZON)
-    config = SafetyConfig(interval=0.1, patience=0.0)
-    layer = SafetyLayer(Blind(plant), config, fallback=(0.0,))
-    with pytest.raises(ValueError, match="truncated the episode after 4 of 20 control intervals"):
-        twinning(env=layer).episode()
-
-
 class Blind(PlantEnv):
     """A system that reports NaN from its fourth interval on."""
 
@@ -354,7 +343,7 @@ class Blind(PlantEnv):
 
 def test_policies_of_equal_weights_are_flown_once(tmp_path, monkeypatch):
     """An unseen episode of a real system may take hours."""
-    run, flown = small_run(tmp_path, episodes=1, untrained=0), []
+    run, flown = small_run(tmp_path, episodes=1), []
     for name in ("fly", "control_costs"):
         call = getattr(run.unseen, name)
         monkeypatch.setattr(run.unseen, name, lambda policy, call=call: flown.append(policy) or call(policy))

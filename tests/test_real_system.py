@@ -128,7 +128,7 @@ def test_an_episode_of_gymnasium_takes_one_reset_with_its_own_seed(layer):
 
 
 def run_on(env, folder, *, figures=False, **options):
-    own = {"compiled": False, "unseen": 3, "figures": figures, "figures_every": 0, "twinning": SMALL}
+    own = {"unseen": 3, "figures": figures, "twinning": SMALL}
     config = RunConfig(log_dir=folder, **own, **options)
     return Run(config, LinearQuadratic(horizon=2.0), env=env)
 
@@ -174,7 +174,6 @@ def test_the_twin_of_it_finds_the_truth(tmp_path):
     assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
     config = RunConfig(
         log_dir=tmp_path,
-        compiled=False,
         unseen=2,
         episodes=1,
         figures=False,
@@ -294,7 +293,7 @@ def test_a_real_controller_is_refused_where_policies_are_judged_in_simulation(si
 
     plant = LinearQuadratic(horizon=2.0)
     env = None if simulated else connected(plant, closure=plant.closure)
-    config = RunConfig(log_dir=tmp_path / "run", compiled=False)
+    config = RunConfig(log_dir=tmp_path / "run")
     with pytest.raises(ValueError, match=r"baselines \['machine'\] can only be flown on a real system"):
         Run(config, plant, env=env, baselines={"machine": Machine})
     assert not (tmp_path / "run").exists()

@@ -31,7 +31,7 @@ from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.results import closure_lines, fit_lines, next_steps, results_table
 from rt_torchrl.runs.results import progress as progress_line
-from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 from rt_torchrl.steps.imitation import of_each_role
@@ -41,7 +41,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
     nothing = {part: dataclasses.replace(getattr(SMALL, part), iterations=0) for part in ("assimilation", "planner")}
     twinning = dataclasses.replace(SMALL, **nothing)
-    metrics = small_run(tmp_path, 1, untrained=0, twinning=twinning).train()
+    metrics = small_run(tmp_path, 1, twinning=twinning).train()
     assert json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail) == metrics
     assert metrics["episodes"][0]["J_p"] is None and metrics["episodes"][0]["real_cost"] > 0.0
     assert "J_a model-based" in capsys.readouterr().out
@@ -173,7 +173,7 @@ REAL = "cost/real episode live policy"  # without brackets, which MLflow does no
 
 
 def trained(folder, logger):
-    metrics = small_run(folder, 2, untrained=0, loggers=(logger,)).train()
+    metrics = small_run(folder, 2, loggers=(logger,)).train()
     return [episode["real_cost"] for episode in metrics["episodes"]]
 
 
@@ -222,28 +222,6 @@ def test_mlflow_has_the_curves_and_the_options(tmp_path, monkeypatch):
 TURBINE = config_class_of(RECIPES / "wind_turbine.py")
 
 
-def episodes(costs, live="model_based"):
-    return [{"live": live, "real_cost": 7.0, "J_a_model_based": cost} for cost in costs]
-
-
-def test_early_stopping_waits_for_its_patience():
-    stop = EarlyStopping(patience=2, least_gain=0.1)
-    assert stop(episodes([5.0, 4.0, 3.9])) is None  # one episode without a gain of a tenth
-    assert stop(episodes([5.0, 4.0, 3.9, 3.7])) == "no gain of 10 % in the last 2 episodes"
-    # Small gains add up to one that counts.
-    assert stop(episodes([5.0, 4.0, 3.9, 3.5])) is None
-    assert stop(episodes([None, None, 4.0])) is None  # a policy that diverges costs more than any number
-    assert stop(episodes([3.0, 2.0, 1.0], live="model_free")) == "no gain of 10 % in the last 2 episodes"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"), [({"patience": 0}, "patience=0"), ({"patience": 1, "least_gain": 1.0}, "least_gain=1.0")]
-)
-def test_impossible_patience_is_refused(arguments, name):
-    with pytest.raises(ValueError, match=name):
-        EarlyStopping(**arguments)
-
-
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
     """A run of at most four episodes that a callback ends after two, with a CSV logger."""
@@ -253,7 +231,7 @@ def stopped(tmp_path_factory):
         seen.append(len(found))
         return "two are enough" if len(found) == 2 else None
 
-    metrics = small_run(folder, 4, untrained=0, loggers=("csv",), parts={"callbacks": [end_after_two]}).train()
+    metrics = small_run(folder, 4, loggers=("csv",), parts={"callbacks": [end_after_two]}).train()
     return folder, metrics, seen
 
 
@@ -372,12 +350,6 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     assert planned.endswith("--what twin")
     beside = said("model_based", math.inf, "receding_horizon", live="model_based", believed="lags")
     assert "the model that it plans on" in planned and "the twin with lags, on which it does not plan," in beside
-
-
-def test_a_small_run_ends_early_by_its_option(tmp_path, monkeypatch):
-    monkeypatch.setattr(EarlyStopping, "cost", staticmethod(lambda episode: 1.0))
-    metrics = small_run(tmp_path / "run", episodes=4, patience=1, untrained=0).train()
-    assert len(metrics["episodes"]) == 2
 
 
 def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():

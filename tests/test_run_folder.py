@@ -22,10 +22,11 @@ from rt_torchrl.atomic_file import write_atomically, write_json, write_results
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import run_folder
-from rt_torchrl.runs.run_config import EarlyStopping, RunConfig
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings, require_same
 from rt_torchrl.steps.plan import MakePlan
+from rt_torchrl.systems.config import OperationConfig
 
 HOLDER = """
 import sys
@@ -120,8 +121,8 @@ def test_a_run_is_not_resumed_with_other_options(tmp_path, options, named):
 
 def test_a_run_is_resumed_with_harmless_options(tmp_path):
     begun(tmp_path)
-    harmless = {"episodes": 7, "figures": False, "figures_every": 0, "untrained": 0, "threads": 1, "reference": True}
-    begun(tmp_path, resume=True, unseen=3, unseen_every=2, compiled=False, **harmless)
+    harmless = {"episodes": 7, "figures": False, "threads": 1, "reference": True}
+    begun(tmp_path, resume=True, unseen=3, unseen_every=2, **harmless)
     assert json.loads((tmp_path / "config.json").read_text())["episodes"] == 7
     # From now on episodes are judged on three unseen ones; the next are not to be judged on others.
     with pytest.raises(ValueError, match="unseen is 4 here and was 3"):
@@ -407,16 +408,16 @@ def test_numbers_that_json_does_not_have_are_null(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(file, found)
     assert not list(tmp_path.iterdir())
-    content = found | {"config": EarlyStopping(patience=3), "folder": tmp_path}
+    content = found | {"config": OperationConfig(), "folder": tmp_path}
     read = json.loads(write_results(file, content).read_text(), parse_constant=pytest.fail)
-    config = {"patience": 3, "least_gain": 0.01}
+    config = {"clock": "simulated", "speed": 1.0, "continuous": False}
     assert read == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "config": config, "folder": str(tmp_path)}
 
 
 # Checkpoints: what they hold, what a damaged one does, and a run that has none yet.
 
 
-QUICK = {"figures": False, "untrained": 0}
+QUICK = {"figures": False}
 
 
 @pytest.fixture(scope="module")

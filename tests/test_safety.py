@@ -77,7 +77,7 @@ def applied(episode):
 def test_range_then_rate_are_exact():
     """a_k = clip(clip(asked, −1, 1.5), a_{k−1} ± r Δt) by a loop over plain numbers."""
     asked = [0.1, 3.0, 3.0, 0.9, -2.0, -2.0, -2.0, -2.0, -2.0, -2.0, 0.5, 0.55, 0.5, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0, -2.0]
-    episode = fly(layer(low=(-1.0,), high=(1.5,), rates=(4.0,), rest=(0.0,)), asked)
+    episode = fly(layer(low=(-1.0,), high=(1.5,), rates=(4.0,)), asked)
     last, expected = 0.0, []
     for value in asked:
         last = min(max(min(max(value, -1.0), 1.5), last - 0.4), last + 0.4)
@@ -125,7 +125,7 @@ def test_a_broken_observation_trips_for_the_hold_time_and_is_held():
     assert [event.step for event in env.report.events] == [4, 5, 6, 7, 8]
 
 
-FREE = {"low": (-math.inf,), "high": (math.inf,), "rates": (math.inf,), "deadline": math.inf, "patience": math.inf}
+FREE = {"low": (-math.inf,), "high": (math.inf,), "rates": (math.inf,), "deadline": math.inf}
 SPIKE = {"value": 7.0, "ranges": {"observation": ((-5.0, -50.0), (5.0, 50.0))}}
 
 
@@ -149,18 +149,6 @@ def test_one_fault_brings_the_fallback_for_one_interval(options, asked, expected
         assert episode["next", "observation"][0, 3, 0] == 7.0
 
 
-def test_an_episode_that_stays_tripped_is_truncated_not_terminated():
-    env = failing(broken=range(5, 20), fallback=(-1.0,), patience=0.4)
-    episode = fly(env, [0.5] * 20)
-    # Tripped at 0.6 s, the end of step 5; 0.4 s later is the end of step 9.
-    assert episode.shape[1] == 10
-    assert episode["next", "truncated"][0, -1] and episode["next", "done"][0, -1]
-    assert not episode["next", "terminated"].any() and not episode["next", "done"][0, :-1].any()
-    assert env.report.counts["truncated"] == 1
-    # One that recovers in between is not.
-    assert fly(failing(broken=[5, 6, 8, 9, 11, 12], fallback=(-1.0,), patience=0.4), [0.5] * 20).shape[1] == 20
-
-
 def test_a_controller_as_fallback_sees_the_last_finite_observation():
     env = failing(broken=[4], fallback=lambda found: 0.25 * found["observation"][..., :1])
     episode = fly(env, [0.5] * 20)
@@ -181,8 +169,8 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this machine has no /dev/full")
 def test_a_log_on_a_full_disk_does_not_stop_a_machine_that_moves():
-    env = layer(rates=(0.1,), rest=(0.0,), log=Path("/dev/full"))
-    assert fly(env, [1.0] * 20).shape[1] == 20 and env.report.counts["rate"] == 20
+    env = layer(rates=(0.1,), log=Path("/dev/full"))
+    assert fly(env, [1.0] + [-1.0] * 19).shape[1] == 20 and env.report.counts["rate"] == 19
     with pytest.raises(OSError, match="No space left"):
         env.reset()
     env.reset()  # once is enough
@@ -190,13 +178,12 @@ def test_a_log_on_a_full_disk_does_not_stop_a_machine_that_moves():
 
 def test_reinforcement_twinning_learns_from_what_was_applied():
     plant = LinearQuadratic(horizon=2.0)
-    env = layer(PlantEnv(plant, seed=0), rates=(1.0,), rest=(0.0,))
+    env = layer(PlantEnv(plant, seed=0), rates=(1.0,))
     found = twinning(plant, env=env)
     report = found.episode()
     assert report["J_p"].isfinite() and env.report.counts["rate"] > 0 and len(env.reports) == 1
     record = found.short_term[-1]
-    steps = torch.cat([torch.zeros(1, 1, dtype=torch.float64), record.actions]).diff(dim=0)
-    assert steps.abs().max() <= 0.1 + 1e-14
+    assert record.actions.diff(dim=0).abs().max() <= 0.1 + 1e-14
     held = {event.step: event.applied for event in env.report.events}
     for k, value in held.items():
         assert record.actions[k].tolist() == value
@@ -211,12 +198,12 @@ def test_specs_hold_around_both_kinds_of_systems():
 
 def test_a_gymnasium_system_is_guarded_in_its_own_precision():
     pytest.importorskip("gymnasium")
-    limits = {"rates": (8.0,), "rest": (0.0,), "ranges": {"observation": (-2.0, 2.0)}, "hold": 0.0}
+    limits = {"rates": (8.0,), "ranges": {"observation": (-2.0, 2.0)}, "hold": 0.0}
     env = SafetyLayer(GymEnv("Pendulum-v1"), SafetyConfig(interval=0.05, **limits), fallback=(0.0,))
     env.set_seed(0)
     torch.manual_seed(0)
     episode = env.rollout(200, break_when_any_done=False)
-    sent = torch.cat([torch.zeros(1, 1), episode["next", "applied"]])
+    sent = episode["next", "applied"]
     assert sent.dtype == torch.float32 and sent.abs().max() <= 2.0
     # Single precision of numbers up to two.
     assert sent.diff(dim=0).abs().max() <= 0.4 + 1e-6
@@ -302,7 +289,7 @@ class FailingMachine(gymnasium.ObservationWrapper):
 def guarded(plant, broken, **options):
     """The machine behind its layer, whose limits and fallback are in the machine's own units."""
     machine = FailingMachine(InShares(gymnasium.make("Pendulum-v1", max_episode_steps=plant.n_steps)), broken)
-    config = SafetyConfig(interval=plant.dt, rates=(RATE / 2.0,), rest=(0.0,), **options)
+    config = SafetyConfig(interval=plant.dt, rates=(RATE / 2.0,), **options)
     return SafetyLayer(GymWrapper(machine), config, fallback=(0.0,))
 
 
@@ -316,12 +303,11 @@ def test_what_was_applied_is_what_the_twin_replays():
     plant = Pendulum(horizon=3.0)
     layer = guarded(plant, broken=20, hold=0.5)
     system = real(layer, plant, applied=APPLIED)
-    asked = iter([2.0, -2.0] * plant.n_steps)
+    asked = iter([RATE * plant.dt] + [-2.0, 2.0] * plant.n_steps)
     flown = system.rollout(plant.n_steps, lambda td: td.set("action", torch.full((1, 1), next(asked)).double()))[0]
     applied, action = flown["next", "applied"], flown["action"]
     assert not torch.allclose(applied, action)
-    before = torch.cat([torch.zeros(1, 1).double(), applied[:-1]])
-    assert ((applied - before).abs() <= RATE * plant.dt + 1e-6).all()
+    assert (applied.diff(dim=0).abs() <= RATE * plant.dt + 1e-6).all()
     # Tripped for half a second from the fault on; the fallback is reached at the rate that holds for it too.
     assert layer.report.counts["fallback"] == 10 and (applied[24:29] == 0.0).all()
     t, nothing = torch.zeros(plant.n_steps).double(), torch.zeros(plant.n_steps, 0).double()

@@ -388,7 +388,7 @@ def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
     config = dataclasses.replace(
         usual, quick=True, horizon=60.0, pace=PACE, port=free_port(), threads=1, log_dir=tmp_path, figures=False
     )
-    module.main(dataclasses.replace(config, untrained=0))
+    module.main(dataclasses.replace(config))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     versions = [record["version"] for record in metrics["episodes"]]
     assert len(versions) == 3 and versions == sorted(versions) and versions[-1] >= 1.0

@@ -37,7 +37,7 @@ GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(
     SMALL,
     assimilation=AssimilationConfig(iterations=20, inputs="record", method="lbfgs"),
-    planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2)),
+    planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0)),
 )
 
 
@@ -60,7 +60,7 @@ class OtherPlant(LinearQuadratic):
 
 
 def training(folder, plant=None, episodes=2, twinning=TWINNING, **options):
-    options = {"untrained": 0, "unseen": 2, "twinning": twinning} | options
+    options = {"unseen": 2, "twinning": twinning} | options
     return small_run(folder, episodes, plant or Config().plant(), config=Config, parts={"first": PD}, **options)
 
 
@@ -141,7 +141,7 @@ def believing(tmp_path_factory):
     folder, known = tmp_path_factory.mktemp("believing") / "run", Suspecting(horizon=4.0)
     config = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
-    options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
+    options = {"episodes": 1, "unseen": 2, "figures": False, "twinning": twinning}
     Run(RunConfig(log_dir=folder, **options), LaggedActuator(known, "force", LAG), believed=known).train()
     return folder, options | {"start": str(folder)}
 

@@ -150,7 +150,7 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     other = leave(tmp_path / "other", seed=0, costs=[7.0, 7.0], valve=6.0, task="engineering")
     found = compare_runs([first[0], seeing, other])
     assert [len(group) for group in found.tasks()] == [2, 1]  # what a policy sees changes no task
-    drawn = leave(tmp_path / "drawn", seed=9, costs=[1.0, 1.0], figures=False, compiled=True, untrained=0)
+    drawn = leave(tmp_path / "drawn", seed=9, costs=[1.0, 1.0], figures=False, threads=2)
     assert [len(row.runs) for row in compare_runs([first[0], drawn]).rows] == [2]  # nor do figures and compilation
     numbers = found.numbers()
     names = list(numbers["rows"])
@@ -255,7 +255,7 @@ def test_systems_and_arms_have_names(tmp_path):
         ({"seeds": 0}, "seeds=0 must be at least 1"),
         ({"arms": ()}, "arms names none"),
         ({"arms": ("sac",)}, "'sac' has no name; write NAME=OPTIONS, or one of twinning"),
-        ({"arms": ("a=", "a=--patience 2")}, "'a' stands for two"),
+        ({"arms": ("a=", "a=--noise 2")}, "'a' stands for two"),
         ({"systems": ("moon=",)}, "names no recipe"),
         ({"given": "--seed 3"}, "--seed: the study gives these to each training"),
         ({"arms": ("x=--log_dir=y",)}, "--log_dir=y: the study gives"),

@@ -11,7 +11,7 @@ RECIPES = fresh_process.ROOT / "recipes"
 
 def trained(name, folder, *options):
     """The summary of a recipe's training, and the mean J_a of each controller's flights on the real system."""
-    few = ("--real-unseen", "10", "--untrained", "0", "--no-figures", "--threads", "1", "--log-dir", str(folder))
+    few = ("--real-unseen", "10", "--no-figures", "--threads", "1", "--log-dir", str(folder))
     done = fresh_process.run(RECIPES / f"{name}.py", *few, *options)
     assert done.returncode == 0, done.stderr[-3000:]
     summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["summary"]

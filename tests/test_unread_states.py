@@ -63,7 +63,7 @@ class Config(RunConfig):
 
 
 def small_config(folder, **options):
-    return Config(log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options)
+    return Config(log_dir=folder, unseen=3, twinning=SMALL, **options)
 
 
 def run_of(config, **options):

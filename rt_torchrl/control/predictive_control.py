@@ -6,7 +6,7 @@ import itertools
 import math
 import statistics
 import time
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -39,8 +39,6 @@ class PredictiveConfig:
         forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, or
             decaying to the mean of the inputs met so far with the time that fits them best; until inputs have been met,
             they are held.
-        virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
-            virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -53,7 +51,8 @@ class PredictiveConfig:
     tolerance: NotNegative = 1e-4
     deadline: Limit = math.inf
     forecast: Literal["held", "decaying"] = "decaying"
-    virtual_episodes: AtLeastOne = 3
+    virtual_episodes: ClassVar[int] = 3
+    """Number of virtual episodes in each of the steps 5 and 6; each takes as long as all solves of a real episode."""
 
     def length(self, plant: Plant) -> float:
         """Length of the window of a plant [s]."""

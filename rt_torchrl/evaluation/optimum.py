@@ -1,4 +1,4 @@
-"""The best policy of a class on the true plant, and what random ones cost."""
+"""The best policy of a class on the true plant."""
 
 import copy
 import math
@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
@@ -15,24 +14,6 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.trajectories.rollout import DivergenceError
-
-
-@torch.no_grad()
-def untrained_costs(
-    unseen: UnseenEpisodes, make_policy: Callable[[torch.Generator], nn.Module], *, starts: int
-) -> Float[Tensor, " {starts}"]:
-    """Mean J_a of random initial policies; a training's cost over it does not depend on the training's own start.
-
-    Args:
-        unseen: the unseen episodes.
-        make_policy: function that draws a random policy of the class.
-        starts: number of policies.
-    """
-    device = unseen.initial_state.device
-    generator = torch.Generator(device=device).manual_seed(UNSEEN_SEED)
-    costs = [unseen.control_costs(make_policy(generator).to(device)).mean().item() for _ in range(starts)]
-    return torch.tensor(costs, dtype=torch.float64, device=device)
-
 
 TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
 FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}

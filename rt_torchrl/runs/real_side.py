@@ -111,6 +111,8 @@ def judged_on(
 
 EVENTS = "events.jsonl"
 """File of the operation's events in a run folder."""
+LEARNING = 0.5
+"""Time that learning from one window takes on the simulated clock, as a share of a window."""
 NOISE = 2**20
 """Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
 
@@ -169,7 +171,7 @@ def operation_of(
     )
     log = folder / EVENTS
     if options.clock == "simulated":
-        learning = round(options.learning * plant.n_steps)
+        learning = round(LEARNING * plant.n_steps)
         return SimulatedOperation(crew.operator(env), learning=learning, log=log)
     if make_env is None:
         raise ValueError(

@@ -85,7 +85,6 @@ def summarise(
     initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
-    untrained: Float[Tensor, " starts"] | None,
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``.
 
@@ -99,12 +98,11 @@ def summarise(
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
     after = {role: judged[role].control_costs.mean().item() for role in ROLES}
     better, chosen_on = better_of(algorithm, unseen)
-    means = {"J_p": J_p, "J_p_before": J_p_before} | ({} if untrained is None else {"J_a_untrained": untrained})
+    means = {"J_p": J_p, "J_p_before": J_p_before}
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     return {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
-        **over_untrained(after, untrained),
         "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on, "J_p_each": J_p.tolist()}
         | {name: mean_with_confidence(values) for name, values in means.items()}
         | results(unseen, judged),
@@ -151,13 +149,6 @@ def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple
         return algorithm.referee.live, "twin"
     costs = of_each_role(algorithm.policies, lambda policy: validation.control_costs(policy).mean().item())
     return min(ROLES, key=costs.__getitem__), "validation episodes"
-
-
-def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:
-    """Mean J_a after training over the mean J_a of random initial policies; empty without these."""
-    if untrained is None:
-        return {}
-    return {f"J_a_over_untrained_{role}": cost / untrained.mean().item() for role, cost in after.items()}
 
 
 def twin_costs(
@@ -321,10 +312,6 @@ def results_table(metrics: dict[str, Any]) -> str:
     for name, before, after, ratio in rows:
         means = f"{_number(unseen[before]['mean'], '.5g'):>12}{_number(unseen[after]['mean'], '.5g'):>12}"
         lines.append(f"  {name:<{width}}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
-    if "J_a_untrained" in unseen:
-        shares = ", ".join(_share(role, found[f"J_a_over_untrained_{role}"]) for role in ROLES)
-        mean = _number(unseen["J_a_untrained"]["mean"], ".4g")
-        lines.append(f"  over a random start's mean J_a{twin} of {mean}: {shares}")
     if "reference" in found:
         best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
@@ -372,10 +359,6 @@ def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
 def _number(value: float | None, digits: str) -> str:
     """A number as text; None, which stands for a number that is not finite, becomes a dash."""
     return "-" if value is None else format(value, digits)
-
-
-def _share(role: str, value: float | None) -> str:
-    return f"{role.replace('_', '-')} {_number(value, '.3g')}"
 
 
 def _interval(found: dict[str, Any]) -> str:

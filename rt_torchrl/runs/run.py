@@ -17,7 +17,6 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
-from rt_torchrl.evaluation.optimum import untrained_costs
 from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, UnseenEpisodes
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
@@ -35,7 +34,7 @@ from rt_torchrl.runs.real_side import (
     simulated,
 )
 from rt_torchrl.runs.results import next_steps, results_table
-from rt_torchrl.runs.run_config import Callback, EarlyStopping, RunConfig, require_device
+from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
 from rt_torchrl.runs.settings import as_written, flat
@@ -54,6 +53,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
 
 
+FIGURES_EVERY = 5
+"""Number of episodes after which the figures are drawn into the dashboard again."""
 PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
 
 
@@ -131,12 +132,10 @@ class Run:
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         self.ended: str | None = None
-        self.callbacks: list[Callback] = list(callbacks)
-        if config.patience:
-            self.callbacks.append(EarlyStopping(patience=config.patience))
+        self.callbacks = callbacks
         device = require_device(config.device)
-        native = config.engine == "native" and device.type == "cpu"
-        compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
+        native = config.engine == "native" and device.type == "cpu"  # which compiles by itself
+        compiled = not native and can_compile(device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
         physics = known_physics(config, plant, believed, real, first, baselines)
@@ -331,13 +330,13 @@ class Run:
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
         done = [*self.episodes, record]
-        short = save_checkpoint(self._held.checkpoint, self.algorithm, done, kept=self.config.checkpoints)
+        short = save_checkpoint(self._held.checkpoint, self.algorithm, done)
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record, self.episodes[0], self.algorithm.policies)
-        every = self.config.figures_every if self.config.figures else 0
-        if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
+        due = self.config.figures and len(self.episodes) % FIGURES_EVERY == 0
+        if due and len(self.episodes) < self.config.episodes:
             safe_point()
             dashboard.images(self._pixels(self._snapshot(), {}), len(self.episodes) - 1)
 
@@ -382,9 +381,7 @@ class Run:
         judged: dict[str, Judged],
         real: dict[str, RealFlights],
     ) -> dict[str, Any]:
-        starts = self.config.untrained
-        untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
-        parts = self.initial_policies, self.initial_closure, self.episodes, untrained
+        parts = self.initial_policies, self.initial_closure, self.episodes
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         if real:
             summary["real_unseen"] = self._real_results(real)

@@ -1,4 +1,4 @@
-"""The options that every recipe has, and what they make: plant, policies, closure, early stopping."""
+"""The options that every recipe has, and what they make: plant, policies, closure."""
 
 import copy
 import dataclasses
@@ -36,42 +36,6 @@ Callback = Callable[[Sequence[dict[str, Any]]], str | None]
 None to go on."""
 
 
-@configuration
-class EarlyStopping:
-    """Ends a training whose live policy has not become better for a while.
-
-    The cost that counts is the live policy's mean J_a over the virtual episodes on the twin. An arm without a twin
-    reports none, and the cost of the real episode counts. Nothing is chosen by the unseen episodes.
-
-    Args:
-        patience: number of episodes in a row without a gain, at least 1.
-        least_gain: least gain that counts, as a share of the least cost so far.
-
-    Raises:
-        ValueError: if an argument is out of its range.
-    """
-
-    patience: AtLeastOne
-    least_gain: Annotated[float, Field(ge=0, lt=1)] = 0.01
-
-    def __call__(self, episodes: Sequence[dict[str, Any]]) -> str | None:
-        """Why the training should end, by the entries of its episodes; None to go on."""
-        least, since = float("inf"), 0
-        for episode in episodes:
-            cost = self.cost(episode)
-            gained = cost < (1.0 - self.least_gain) * least
-            least, since = (cost, 0) if gained else (least, since + 1)
-        if since < self.patience:
-            return None
-        return f"no gain of {100.0 * self.least_gain:g} % in the last {since} episodes"
-
-    @staticmethod
-    def cost(episode: dict[str, Any]) -> float:
-        """The cost of an episode that counts."""
-        found = episode.get(f"J_a_{episode['live']}", episode["real_cost"])
-        return float("inf") if found is None else float(found)
-
-
 LoggerName = Literal["csv", "wandb", "mlflow"]
 PACKAGES: tuple[LoggerName, ...] = ("wandb", "mlflow")
 """Loggers that need the package of their name."""
@@ -83,6 +47,8 @@ Preset = Literal["default", "paper", "neural", "mpc"]
 """Name of what the options of a training are by default."""
 STARTS = ("random", "controller", "mpc")
 """Values of the option ``start`` that name no file."""
+NEURAL_HIDDEN = (16, 16)
+"""Widths of the hidden layers of a closure with a perceptron."""
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
 GREATEST_SEED = 2**63 - 2
 """Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
@@ -103,16 +69,10 @@ class RunConfig:
             initial weights of the model-based policy.
         closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
             call its plant's own law paper. An mlp has the defaults of the preset neural.
-        closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number n_e of real episodes.
-        patience: number of episodes without a gain of 1 % in the live policy's cost on the twin after which the
-            training ends early; with 0 it never does.
         seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
             GPUs), odeint_adjoint (the paper's continuous adjoint, slow) or autograd (exact, slow).
-        compiled: whether to compile with torch.compile what PyTorch computes. By default the engine native compiles
-            nothing, because it computes itself; beside other engines, what may be compiled (parallel, environments) is
-            if this machine can, and a notice says if it cannot. Without it every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default or, beside an acting process, takes the cores that it
             leaves. Updates of step 2 run on one.
@@ -127,7 +87,6 @@ class RunConfig:
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
-        checkpoints: number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
             unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end, in simulation. Those of a
@@ -138,13 +97,10 @@ class RunConfig:
             real system can fly do so as many times, and are refused with 0.
         preflight: whether the first flight of a real system is compared with one-step predictions of the twin before
             anything is learned, and wiring that does not fit is refused; see :func:`check_real_system`.
-        untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
-            compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
             unseen episodes.
-        figures: whether to draw figures; without them a training among many ends sooner.
-        figures_every: number of episodes after which the figures are drawn into the dashboard again; they are drawn at
-            the end too, and with 0 only there.
+        figures: whether to draw figures, every five episodes into the dashboard and at the end into figures/; without
+            them a training among many ends sooner.
         unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
             is judged only at the end.
         loggers: loggers of TorchRL to write the curves to beside TensorBoard: csv (into csv/ of the run folder), wandb
@@ -163,12 +119,9 @@ class RunConfig:
     hidden: Widths = (32, 32)
     model_free_policy: str = "same"
     closure: Literal["plant", "mlp"] = "plant"
-    closure_hidden: Widths = (16, 16)
     episodes: AtLeastOne = 20
-    patience: Count = 0
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = 0
     engine: Engine = "native"
-    compiled: bool | None = None
     device: str = "cpu"
     threads: Count = 0
     start: Text = "random"
@@ -177,15 +130,12 @@ class RunConfig:
     log_dir: File | None = None
     resume: bool = False
     overwrite: bool = False
-    checkpoints: AtLeastOne = 3
     quick: bool = False
     unseen: Annotated[int, Field(ge=2)] = 20
     real_unseen: Count = 0
     preflight: bool = True
-    untrained: Count = 20
     reference: bool = False
     figures: bool = True
-    figures_every: Count = 5
     unseen_every: Count = 0
     loggers: tuple[LoggerName, ...] = ()
     noise: NotNegative = 0.0
@@ -239,7 +189,7 @@ class RunConfig:
             ValueError: if the plant has no neural closure.
         """
         if self.closure == "mlp":
-            return plant.make_neural_closure(generator, self.closure_hidden)
+            return plant.make_neural_closure(generator, NEURAL_HIDDEN)
         return plant.make_closure(generator)
 
     def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
@@ -338,7 +288,6 @@ class RunConfig:
             episodes=min(self.episodes, QUICK_EPISODES),
             unseen=QUICK_UNSEEN,
             real_unseen=min(self.real_unseen, QUICK_UNSEEN),
-            figures_every=0,
             twinning=twinning,
         )
 

@@ -157,6 +157,8 @@ def _base(value: float | str) -> float | str:
 CHECKPOINT = "checkpoint.pt"
 """File of the newest checkpoint in a run folder."""
 FORMAT = 5
+KEPT = 3
+"""Number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before."""
 NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
 """Name of an earlier checkpoint."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -164,16 +166,13 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 ANEW = "To train anew in this folder, use --overwrite."
 
 
-def save_checkpoint(
-    path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]], *, kept: int = 1
-) -> str | None:
+def save_checkpoint(path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> str | None:
     """Write a checkpoint; the earlier checkpoint stays intact until the new one is complete.
 
     Args:
         path: file of the newest checkpoint. Earlier ones lie beside it, with their number of episodes in their name.
         algorithm: algorithm to save.
         episodes: records of the episodes that are done.
-        kept: number of checkpoints that are kept, with the new one.
 
     Returns:
         None; or, if the disk is full and earlier checkpoints had to go to make room, a sentence that says so.
@@ -187,7 +186,7 @@ def save_checkpoint(
         "episodes": episodes,
         "state": {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()},
     }
-    if kept > 1 and path.is_file():
+    if path.is_file():
         _keep(path, len(episodes) - 1)
     try:
         save_tensors(path, content)
@@ -199,7 +198,7 @@ def save_checkpoint(
             old.unlink(missing_ok=True)
         save_tensors(path, content)
         return f"the disk of {path.parent} is full; {len(older)} earlier checkpoints went to save the present one"
-    for old in earlier(path)[max(0, kept - 1) :]:
+    for old in earlier(path)[KEPT - 1 :]:
         old.unlink(missing_ok=True)
     return None
 

@@ -122,7 +122,7 @@ def _require_same_closure(folder: Path, its: nn.Module, ours: nn.Module) -> None
     if type(its) is not type(ours) or shapes[0] != shapes[1]:
         raise ValueError(
             f"start={str(folder)!r} is a run whose twin has a closure {type(its).__name__}, which does not fit the "
-            f"{type(ours).__name__} of this run; give that run's --closure and --closure-hidden."
+            f"{type(ours).__name__} of this run; give that run's --closure."
         )
 
 

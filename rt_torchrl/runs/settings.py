@@ -169,14 +169,9 @@ def _same(one: str | None, other: str) -> bool:
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
 OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
 """Options that a file of options never gives."""
-BESIDE_TRAINING = {
-    *("figures", "figures_every", "untrained", "reference", "checkpoints", "loggers"),
-    # These change a result by rounding alone.
-    *("threads", "compiled"),
-    *OF_THE_CALL,
-}
+BESIDE_TRAINING = {"figures", "reference", "loggers", "threads", *OF_THE_CALL}
 """Options of the place, the reports and the speed of a run, under which it trains and costs the same."""
-HARMLESS = {*BESIDE_TRAINING, "episodes", "patience", "unseen_every", "real_unseen"}
+HARMLESS = {*BESIDE_TRAINING, "episodes", "unseen_every", "real_unseen"}
 """Options that may differ when a run is resumed: these and those of its length."""
 ABSENT = "nothing"
 

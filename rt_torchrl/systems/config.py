@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, SkipValidation
 
-from rt_torchrl.options import AtLeastOne, File, Limit, NotNegative, Positive, Share, Unbounded, array_of, configuration
+from rt_torchrl.options import File, Limit, Positive, Share, Unbounded, array_of, configuration
 
 Range = Annotated[tuple[float | Sequence[float], float | Sequence[float]], SkipValidation]
 """Least and greatest values, which are checked in words of their own."""
@@ -23,17 +23,15 @@ class SafetyConfig:
         interval: control interval of the system [s].
         low: least value of each action, where it is to be above the system's own.
         high: greatest value of each action, where it is to be below the system's own.
-        rates: greatest rate of change of each action [unit/s]; infinity does not limit it.
-        rest: action, within its range, from which the rate limits the first action of an episode; with None the rate
-            of the first action is free. A :class:`ConnectedPlant` with an entry ``applied`` says what the machine has
-            applied last, and the rate limits the first action from there.
+        rates: greatest rate of change of each action [unit/s]; infinity does not limit it. That of the first action of
+            an episode is free, unless a :class:`ConnectedPlant` with an entry ``applied`` says what the machine has
+            applied last.
         ranges: admissible range (low, high) of entries of the observation, by name; each end is one number for all
             components or one number for each component.
         limits: range (low, high) of entries of the observation in which the system is to stay, as ``ranges``. Beyond it
             the fallback acts, and the reading is learned from.
         clock: entry of the observation that holds the system's clock [s], where it has one. A sample that comes twice
-            or is left out, and a clock that jumps, show in it.
-        clock_tolerance: greatest difference between the clock's step and the interval [s]; None for half an interval.
+            or is left out, and a clock that jumps, show in it by more than half an interval.
         frozen: entries of the observation whose components always move, by name, each with the number of equal readings
             in a row that count as a frozen sensor: one number for all components, or one for each, where 0 does not
             watch a component.
@@ -42,7 +40,6 @@ class SafetyConfig:
         deadline: longest wall-clock time from an action to the observation of its effect [s].
         hold: time without a fault after which the policy acts again [s]; with infinity it does not act again in the
             same episode.
-        patience: time of uninterrupted fallback after which the episode is truncated [s].
         log: file to which every event is appended, as one JSON object per line.
 
     Raises:
@@ -53,16 +50,13 @@ class SafetyConfig:
     low: tuple[Unbounded, ...] | None = None
     high: tuple[Unbounded, ...] | None = None
     rates: tuple[Unbounded, ...] | None = None
-    rest: tuple[float, ...] | None = None
     ranges: Mapping[str, Range] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     clock: str | None = None
-    clock_tolerance: Positive | None = None
     frozen: Mapping[str, Count] = field(default_factory=dict)
     following: tuple[Unbounded, ...] | None = None
     deadline: Limit = math.inf
     hold: Duration = 0.0
-    patience: Duration = math.inf
     log: File | None = None
 
     def __post_init__(self) -> None:
@@ -120,15 +114,11 @@ class OperationConfig:
     """Options of an operation that goes on while the algorithm learns, with ``asynchronous``.
 
     Args:
-        clock: simulated: one process, in which learning takes the time ``learning`` of operation, so that a run repeats
-            to the bit; for systems in simulation. wall: the system operates in a process of its own, at the pace of the
+        clock: simulated: one process, in which learning takes half a window of operation, so that a run repeats to the
+            bit; for systems in simulation. wall: the system operates in a process of its own, at the pace of the
             wall clock.
-        learning: time that learning from one window takes on the simulated clock, as a share of a window. With 0 each
-            window begins with what was learned from the one before, as in a run that is not asynchronous.
         speed: pace of a simulation on the wall clock, in seconds of the plant for each second; real systems keep their
             own time.
-        handover: number of control intervals in which the difference between a policy and the one before it fades, if
-            it is as wide as the range of the action; the actuators' own rate limits it too.
         continuous: whether only the first window begins with a reset of the system; an episode is then a window of
             operation.
 
@@ -137,7 +127,5 @@ class OperationConfig:
     """
 
     clock: Literal["simulated", "wall"] = "simulated"
-    learning: NotNegative = 0.5
     speed: Positive = 1.0
-    handover: AtLeastOne = 20
     continuous: bool = False

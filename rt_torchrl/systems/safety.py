@@ -28,7 +28,7 @@ WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
 KEPT = 16
 """Number of episodes whose reports are kept: a system may operate for years."""
 TOLERANCE = 0.5
-"""Share of an interval by which the system's clock may miss it, unless a tolerance is given."""
+"""Share of an interval by which the system's clock may miss it."""
 ROUNDING = 1e-9
 """Slack in comparisons of times that are sums of intervals [s], and share of a rate by which rounding may exceed it."""
 
@@ -42,8 +42,7 @@ class SafetyEvent(NamedTuple):
     ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
     policy's action was not finite, and ``fallback`` that the fallback acted. ``missing``, ``not finite``, ``out of
     range``, ``frozen``, ``clock`` and ``late`` are faults of the observation at the end of the interval. ``limit`` says
-    that the system has left its limits, and ``actuator`` that an actuator does not follow. ``truncated`` says that the
-    layer ended the episode.
+    that the system has left its limits, and ``actuator`` that an actuator does not follow.
     """
 
     episode: int
@@ -150,12 +149,12 @@ class Watchdog:
 
     def __init__(self, config: SafetyConfig):
         self.config = config
-        self._tolerance = config.clock_tolerance or TOLERANCE * config.interval
+        self._tolerance = TOLERANCE * config.interval
         self.begin()
 
     def begin(self) -> None:
         """Begin a new episode, in which nothing has been read and no fault has been seen."""
-        self._since, self._until = math.inf, -math.inf
+        self._until = -math.inf
         self._sound = self._last = -math.inf  # the clock at the last sound reading, and at the last reading
         self._intervals, self.stale = 0, 0  # since the last sound reading of the clock
         self._values: dict[str, tuple[Tensor, Tensor]] = {}
@@ -212,19 +211,12 @@ class Watchdog:
     def note(self, t: float, faulty: bool) -> None:
         """Take note of an observation at time t of the episode [s] and whether it was faulty."""
         if faulty:
-            self._since = min(self._since, t)
             # Without a hold time the watchdog is tripped for the interval that begins now.
             self._until = t + max(self.config.hold, 2.0 * ROUNDING)
-        elif not self.tripped(t):
-            self._since = math.inf
 
     def tripped(self, t: float) -> bool:
         """Whether the fallback acts in the interval that begins at t [s]."""
         return t < self._until - ROUNDING
-
-    def exhausted(self, t: float) -> bool:
-        """Whether the watchdog has been tripped, at t [s], for as long as its patience."""
-        return self.tripped(t) and t - self._since >= self.config.patience - ROUNDING
 
 
 class SafetyLayer(AroundSystem):
@@ -244,10 +236,6 @@ class SafetyLayer(AroundSystem):
     A learner learns from ``("next", "applied")``, not from the ``action`` that the policy asked for.
     ``ReinforcementTwinning`` learns nothing from the intervals before and after a refused observation.
 
-    A shutdown truncates the episode and does not terminate it. Where rewards are negative costs, a return that ends
-    with the shutdown would make the shutdown the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
-    ``patience`` at infinity there, and the fallback acts up to the horizon.
-
     The layer runs in the process that steps the system. It notices a late observation only when the observation
     arrives, and it cannot end a call that never returns. A machine needs its own protection behind it.
 
@@ -261,8 +249,8 @@ class SafetyLayer(AroundSystem):
 
     Raises:
         ValueError: if there is more than one system or action entry, the action is not continuous, the interval is not
-            that of a simulation behind it, a number does not fit the actions, or ``rest`` or a constant ``fallback``
-            lies outside their range.
+            that of a simulation behind it, a number does not fit the actions, or a constant ``fallback`` lies outside
+            their range.
     """
 
     def __init__(
@@ -289,7 +277,6 @@ class SafetyLayer(AroundSystem):
         self._unwritten: OSError | None = None
         self._make_specs()
         self.watchdog, self.limits = Watchdog(config), ActionLimits(env.action_spec, config)
-        self._rest = None if config.rest is None else self.limits.sendable("rest", config.rest)
         self._following = None if config.following is None else self.limits.constant("following", config.following)
         self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
         if config.log is not None:
@@ -308,12 +295,8 @@ class SafetyLayer(AroundSystem):
             observation["applied"] = Unbounded(shape=action.shape, dtype=action.dtype, device=self.device)
         for flag in ("tripped", "refused"):
             observation[flag] = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
-        self.observation_spec = observation
+        self.observation_spec, self.done_spec = observation, self.env.full_done_spec.clone()
         self.action_spec, self.reward_spec = action.clone(), self.env.reward_spec.clone()
-        done = self.env.full_done_spec.clone()
-        if "truncated" not in done:
-            done["truncated"] = done["done"].clone()
-        self.done_spec = done
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
     @property
@@ -339,11 +322,11 @@ class SafetyLayer(AroundSystem):
         if faults:
             read = {key: reading[key].flatten().tolist() for key in self._watched if key in reading}
             raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
-        self._step_count, self._passed, self._last, self._good = 0, 0, self._rest, {}
+        self._step_count, self._passed, self._last, self._good = 0, 0, None, {}
         if getattr(innermost(self.env), "reads_applied", False):
             self._last = reading["applied"].clone()  # of a machine in operation
         self._flags = self._flag(False), self._flag(False)
-        return self._begun(reading, self._rest)
+        return self._begun(reading, None)
 
     def _begun(self, reading: TensorDictBase, applied: Tensor | None) -> TensorDictBase:
         """What an episode or a window begins with; the machine need not say what it has applied."""
@@ -351,7 +334,6 @@ class SafetyLayer(AroundSystem):
         if "applied" not in reading:
             reading["applied"] = self.action_spec.zero() if applied is None else applied.clone()
         reading["tripped"], reading["refused"] = (flag.clone() for flag in self._flags)
-        reading["truncated"] = reading.get("truncated", self._flag(False))
         return reading
 
     def _count_window(self) -> None:
@@ -384,10 +366,6 @@ class SafetyLayer(AroundSystem):
             first = max(0, self._step_count - self.watchdog.stale)
             self.report.wrong.update(range(first, self._step_count + 1))
         reasons |= faults | self._not_followed(applied, reading["applied"])
-        reading["truncated"] = reading.get("truncated", self._flag(False))
-        if self.watchdog.exhausted(end):
-            reasons["truncated"] = f"tripped for {self.config.patience:g} s"
-            reading["truncated"], reading["done"] = self._flag(True), self._flag(True)
         self._note(reasons, tensordict["action"], applied)
         self._last, self._step_count = applied, self._step_count + 1
         return reading

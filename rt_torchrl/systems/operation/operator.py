@@ -29,6 +29,8 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 FIRST = "first"
 """Name of the policy or state feedback that acts before the trained policies do."""
+HANDOVER = 20
+"""Number of control intervals in which an offset of a handover as wide as the range of the action fades."""
 
 
 class Order(NamedTuple):
@@ -458,8 +460,7 @@ class Crew:
         env = self.make_env() if env is None else env
         generator = torch.Generator(device=env.device).manual_seed(self.seed)
         first = next(iter(self.policies.values()))
-        handover = self.config.handover
-        actor = BumplessPolicy(self.plant, first, self.exploration, intervals=handover, generator=generator)
+        actor = BumplessPolicy(self.plant, first, self.exploration, intervals=HANDOVER, generator=generator)
         paced = self.config.clock == "wall" and getattr(env, "pace", None) is None
         pace = Pace(self.plant.dt / self.config.speed) if paced else None
         return Operator(env, actor, self.policies, continuous=self.config.continuous, pace=pace)

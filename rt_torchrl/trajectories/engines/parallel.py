@@ -246,7 +246,7 @@ def compiled_if(
     if missing:
         raise RuntimeError(
             f"compiled=True needs {missing}, which this machine lacks. Install it (Debian: apt-get install g++ "
-            "python3-dev) or choose compiled=False; a recipe takes --compiled False."
+            "python3-dev) or choose compiled=False."
         )
     return _compile(function)
 
