@@ -27,7 +27,6 @@ from rt_torchrl import (
 from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
-from rt_torchrl.runs.settings import read_settings
 
 FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c", "discon"), "twin": ("c",)}
 """The formats that there are of each thing."""
@@ -88,9 +87,7 @@ def main(config: Config) -> None:
     formats = config.formats or DEFAULT
     if "onnx" in formats:
         require_packages(ONNX_PACKAGES)
-    settings = read_settings(config.run)
-    beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
-    run = load_run(config.run, config.recipe or beside)
+    run = load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, StateFeedback) and {"policy", "controller"} & set(config.what):
         name = run.twin.hypothesis

@@ -184,7 +184,7 @@ class Training:
         asked = self.asked()
         found = differences(self.folder, asked, HARMLESS - {"unseen_every"})
         recipe, mine = read_settings(self.folder).get("recipe"), settings_of(asked, "")["recipe"]["file"]
-        if recipe and recipe.get("file") != mine:  # a run of version 0.1 names none
+        if recipe and recipe.get("file") != mine:
             found.append(f"the recipe is {mine} here and was {recipe.get('file')} in the run")
         metrics = read_json(self.folder / "metrics.json")
         done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes

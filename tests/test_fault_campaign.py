@@ -151,7 +151,7 @@ def broken(whole, number, trace):
         case 3 if number % 4:
             return pickle.dumps({"format": Bomb(trace)})
         case 3:
-            torch.save({"format": run_folder.FORMAT, "episodes": [], "state": Bomb(trace)}, file)
+            torch.save({"format": run_folder.FORMAT, "episodes": [], "state": Bomb(trace)}, file)  # without a seal
             return file.read_bytes()
         case 4:
             save_tensors(file, {"weights": torch.zeros(3)})

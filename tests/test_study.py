@@ -31,6 +31,7 @@ def leave(folder, *, seed, costs, curve=(4.0, 2.0), arm="twinning", plant="tanks
     options = {"plant": plant, "recipe": {}, "seed": seed, "twinning": {"arm": arm}, "ran": [seed], **settings}
     (folder / "config.json").write_text(json.dumps(options))
     unseen = {
+        "judged_on": "simulation",
         "episodes": len(costs),
         "costs": {"model_based": costs, "model_free": [9.0] * len(costs), "PI": [valve] * len(costs)},
         "merit": {"model_based": {"power [W]": {"mean": seed}}, "model_free": {"power [W]": {"mean": 0.0}}},

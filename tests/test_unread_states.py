@@ -10,7 +10,6 @@ from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from seeds_and_numbers import seeded
-from served_plants import served
 from small_runs import SMALL, small_run
 from test_classical import PD
 from test_export_controller import InC
@@ -31,14 +30,12 @@ from rt_torchrl import (
     shipped_plants,
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.machine.rehearsal import served_system
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
 from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.trajectories.rollout import Rollout
@@ -369,23 +366,6 @@ def test_past_observations_are_what_sensors_read_then():
         by_machine, by_steps = (collector.rollout()["observation"] for collector in collectors)
         torch.testing.assert_close(by_machine, by_steps, rtol=1e-12, atol=1e-13)
         torch.testing.assert_close(by_machine, by_hand(by_machine[..., :2], 2), rtol=1e-14, atol=0.0)
-
-
-def test_a_served_plant_serves_no_past_observations():
-    base = LinearQuadratic(horizon=2.0)
-    plant = StackedObservations(base, 2)
-    with served(base, "modbus", safe=(0.0,), period=0.1) as (_, port):
-        system = served_system(plant, safe=(0.0,), protocol="modbus", port=port, period=0.1, served=base)
-        found, seen = system.reset(), []
-        for _ in range(5):
-            found = system.step(found.set("action", torch.tensor([[0.5]], dtype=torch.float64)))
-            seen.append(found["observation"])
-            found = system.step_mdp(found)
-        system.close()
-    seen = torch.stack(seen, 1)
-    torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
-    with pytest.raises(ValueError, match="served='cryogenic_tank' lacks position, velocity, which plant"):
-        served_system(plant, safe=(0.0,), served=CryogenicTank())
 
 
 def test_what_the_environment_does_not_report_is_refused_by_its_name():

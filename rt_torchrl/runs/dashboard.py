@@ -68,8 +68,6 @@ GROUPS = {
 """Tags of entries of which an episode has several, by what they begin with."""
 REFUSED = re.compile(r"[^\w\-. /]")
 """What only TensorBoard gets in a name: MLflow refuses brackets and commas, names of files on Windows colons."""
-OVER_THE_FIRST = ("real_cost", "J_p", "J_a_model_based", "J_a_model_free")
-"""Costs that are shown over that of the first episode, too, as the paper shows them."""
 COSTS = [
     TAGS[key] for key in ("real_cost", "J_a_model_based", "J_a_model_free", "J_a_unseen", "J_a_unseen_on_the_twin")
 ]
@@ -122,12 +120,11 @@ class Dashboard:
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
-    def episode(self, record: Mapping[str, Any], first: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
+    def episode(self, record: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
         """Write the scalars of one episode, and the weights after it.
 
         Args:
             record: entry of the episode in ``metrics.json``.
-            first: that of the first episode, over whose costs the curves of ``cost over the first`` are.
             policies: both policies by role.
         """
         step, live = record["episode"], record["live"].replace("_", "-")
@@ -135,9 +132,6 @@ class Dashboard:
             if key in record:
                 self.scalar(tag, record[key], step)
         self.scalar(f"cost/real episode ({live})", record["real_cost"], step)
-        for key in OVER_THE_FIRST:
-            if key in record and first.get(key) and np.isfinite(first[key]):
-                self.scalar(f"cost over the first/{TAGS[key].split('/')[1]}", record[key] / first[key], step)
         self._weights(record, policies)
         self.scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
         for event in ("swap", "clone"):

@@ -137,9 +137,9 @@ def _merits(run: LoadedRun) -> Reason:
     A plant does not say whether more of a quantity is better, so that the user has to judge.
     """
     name, remedy = "the cost is not what was meant", "weights of the cost (docs/observations_and_costs.md)"
-    unseen: dict[str, Any] = run.metrics["summary"].get("unseen", {})
-    live, others = run.live, unseen.get("baselines", {})
-    merit = unseen.get("merit", {}).get(live)
+    unseen: dict[str, Any] = run.metrics["summary"]["unseen"]
+    live, others = run.live, unseen["baselines"]
+    merit = unseen["merit"][live]
     if not merit or not others:
         return Reason(name, None, "no classical controller flew beside the policy, or the plant has no merit", remedy)
     own, apart = unseen[f"J_a_{live}"]["mean"], []

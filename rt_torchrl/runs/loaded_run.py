@@ -16,7 +16,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.metrics import read_metrics
+from rt_torchrl.runs.metrics import on_the_twin, read_metrics
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant, worn_closure
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
@@ -78,7 +78,7 @@ class LoadedRun:
     @property
     def _only_on_the_twin(self) -> bool:
         """Whether nobody knows the true closure of the real system."""
-        return self.metrics["summary"].get("unseen", {}).get("judged_on") == "twin"
+        return on_the_twin(self.metrics["summary"]["unseen"])
 
     def table(self) -> "pandas.DataFrame":
         """The episodes as a table: a row for each, a column for each entry; nested entries are ``seconds.plan``.
@@ -207,7 +207,7 @@ class LoadedRun:
         on_the_twin, record = isinstance(flown, TwinFlight), flown
         record = record if record.states.dim() == 2 else record.each()[0]
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
-        segment = self.metrics["summary"].get("twin", {}).get("segment", 0)
+        segment = self.metrics["summary"]["twin"]["segment"]
         process, signals = None, self.physics.acting_inputs
         if self.config.twinning.arm != "model_free" and signals:
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
@@ -281,7 +281,7 @@ def load_run(
 def _twin(
     folder: Path, config: RunConfig, physics: Plant, closure: nn.Module, hypotheses: dict[str, Any] | None
 ) -> DigitalTwin:
-    """The twin of a run; one of 0.1.0 and one that had no hypotheses is alone."""
+    """The twin of a run; one that had no hypotheses is alone."""
     if hypotheses is None:
         return DigitalTwin(physics, closure)
     twin = make_twin(physics, closure, config.twinning.hypotheses)

@@ -34,9 +34,9 @@ def on_the_twin(unseen: Mapping[str, Any]) -> bool:
     """Whether the costs on unseen episodes are those of the twin, and not of the real system or its simulation.
 
     Args:
-        unseen: entry ``unseen`` of the summary; that of an earlier version does not say.
+        unseen: entry ``unseen`` of the summary.
     """
-    return unseen.get("judged_on") == "twin"
+    return unseen["judged_on"] == "twin"
 
 
 def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], Role]:

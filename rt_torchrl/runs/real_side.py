@@ -109,8 +109,6 @@ def judged_on(
     return unseen
 
 
-EVENTS = "events.jsonl"
-"""File of the operation's events in a run folder."""
 LEARNING = 0.5
 """Time that learning from one window takes on the simulated clock, as a share of a window."""
 NOISE = 2**20
@@ -135,7 +133,6 @@ def operation_of(
     policies: Mapping[Role, nn.Module],
     *,
     first: Start | None = None,
-    folder: Path,
 ) -> Operation:
     """The operation of a run.
 
@@ -146,7 +143,6 @@ def operation_of(
         plant: physics of the twin.
         policies: both policies by role.
         first: what the training begins with, whose teacher may act, too.
-        folder: run folder, for the log of the events.
 
     Raises:
         ValueError: if episodes of the plant may end early; on the wall clock, if there is no function that makes the
@@ -169,17 +165,16 @@ def operation_of(
         options,
         seed=episode_seed(config.seed, NOISE),
     )
-    log = folder / EVENTS
     if options.clock == "simulated":
         learning = round(LEARNING * plant.n_steps)
-        return SimulatedOperation(crew.operator(env), learning=learning, log=log)
+        return SimulatedOperation(crew.operator(env), learning=learning)
     if make_env is None:
         raise ValueError(
             "clock='wall' needs the real system in a process of its own; give Run(..., env=) a function that makes it."
         )
     if config.device != "cpu":
         raise ValueError(f"clock='wall' acts on the CPU alone, and device={config.device!r}; give --device cpu.")
-    return ProcessOperation(crew, env, log=log)
+    return ProcessOperation(crew, env)
 
 
 def end_operation(algorithm: ReinforcementTwinning) -> None:

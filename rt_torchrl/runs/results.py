@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
@@ -97,7 +96,6 @@ def summarise(
     before = of_each_role(initial_policies, unseen.control_costs)
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
     after = {role: judged[role].control_costs.mean().item() for role in ROLES}
-    better, chosen_on = better_of(algorithm, unseen)
     means = {"J_p": J_p, "J_p_before": J_p_before}
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     return {
@@ -108,12 +106,10 @@ def summarise(
         | results(unseen, judged),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
-        "better": better,
-        "better_chosen_on": chosen_on,
+        "better": better_of(algorithm, unseen),
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
         "twin": fit_of(algorithm),
-        "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "hypotheses": hypotheses_of(algorithm.twin),
         "believed": algorithm.twin.hypothesis,
         "seconds": seconds_per_step(episodes),
@@ -138,17 +134,17 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple[Role, str]:
-    """The better policy, and the name of the episodes that decided; its cost is reported on other episodes.
+def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> Role:
+    """The better policy; its cost is reported on other episodes.
 
     It is the policy with the smaller mean J_a on validation episodes. On a real system of unknown closure these would
     have to be flown; there it is the live one.
     """
     validation = unseen.validation()
     if validation is None:
-        return algorithm.referee.live, "twin"
+        return algorithm.referee.live
     costs = of_each_role(algorithm.policies, lambda policy: validation.control_costs(policy).mean().item())
-    return min(ROLES, key=costs.__getitem__), "validation episodes"
+    return min(ROLES, key=costs.__getitem__)
 
 
 def twin_costs(
@@ -177,20 +173,6 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
             for kind, chosen in kinds.items()
         },
     }
-
-
-def closure_errors(
-    algorithm: ReinforcementTwinning, start: nn.Module, true: nn.Module | None
-) -> dict[str, list[float]] | None:
-    """RMS error of every coefficient of the closures ``found`` and ``start`` along the last real episode.
-
-    It is None if the real system's closure is not known.
-    """
-    if true is None:
-        return None
-    laws = {"found": algorithm.twin.believed_law, "start": start}
-    features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
-    return {name: rms_error(law, true, features).tolist() for name, law in laws.items()}
 
 
 def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
@@ -254,7 +236,6 @@ def reference_entry(
     return {
         "reference": {
             "J_a": optimum.cost,
-            "J_a_of_each_start": optimum.costs,
             "J_a_by_gradients": optimum.by_gradients,
             "better_over_reference": better.mean().item() / optimum.cost,
         }
@@ -300,7 +281,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     """The table of results that the terminal shows at the end of a run."""
     found = metrics["summary"]
     unseen, n = found["unseen"], found["unseen"]["episodes"]
-    where = WHERE.get(unseen.get("judged_on", ""), "")
+    where = WHERE.get(unseen["judged_on"], "")
     twin = " on the twin" if on_the_twin(unseen) else ""
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
@@ -320,7 +301,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
     lines += merit_lines(unseen)
-    lines += real_lines(found.get("real_unseen"), found.get("twin", {}).get("segment", 0))
+    lines += real_lines(found.get("real_unseen"), found["twin"]["segment"])
     paid = found["cost_of_learning"]
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
@@ -328,12 +309,11 @@ def results_table(metrics: dict[str, Any]) -> str:
         f"  live at the end: {found['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
         f"{paid['episodes']} episodes{judging}, largest {most}"
     )
-    lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
+    lines += hypothesis_lines(found["hypotheses"], found["believed"])
     lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
-    lines += fit_lines(found.get("twin"))
-    errors = found.get("twin", {}).get("standard_errors", {})
-    lines += closure_lines(found["closure"], most=MOST_WEIGHTS, errors=errors)
+    lines += fit_lines(found["twin"])
+    lines += closure_lines(found["closure"], most=MOST_WEIGHTS, errors=found["twin"]["standard_errors"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
 
@@ -395,9 +375,9 @@ def _value(found: dict[str, Any]) -> str:
     return _number(found["mean"], ".4g") + (f" ({_number(found['median'], '.4g')})" if "median" in found else "")
 
 
-def fit_lines(twin: dict[str, Any] | None) -> list[str]:
+def fit_lines(twin: dict[str, Any]) -> list[str]:
     """A line with the twin's RMS errors over the records, or the segments, that it was last fitted to."""
-    if not twin or not twin["rms"]:
+    if not twin["rms"]:
         return []
     where = f"segments of {twin['segment']} intervals" if twin["segment"] else "its last records"
     return [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
@@ -414,7 +394,7 @@ def closure_lines(
     if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
-    described = closure.get("described", {})  # runs of 0.1.0 have none
+    described = closure["described"]
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'std. error':>12}" if errors else "")]
     lines[0] += f"{'true':>12}" if true else ""
     chosen = list(closure["found"])
@@ -502,7 +482,7 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
     else:
         planner = None if config is None else config.twinning.planner.method
-        steps += _taking_away(live, folder, planner, found.get("believed"), alone=alone)
+        steps += _taking_away(live, folder, planner, found["believed"], alone=alone)
     if twin:
         steps.append(
             "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"

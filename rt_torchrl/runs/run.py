@@ -25,7 +25,6 @@ from rt_torchrl.runs import real_side, results
 from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress, make_loggers
 from rt_torchrl.runs.real_side import (
-    EVENTS,
     RealFlights,
     end_operation,
     judged_on,
@@ -192,9 +191,7 @@ class Run:
         table, twin = config.twinning, twin_of(config, physics, closure, first, compiled=compiled)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         self.algorithm = ReinforcementTwinning(
-            operation_of(config, env, make_env, physics, policies, first=first, folder=self.folder)
-            if config.asynchronous
-            else env,
+            operation_of(config, env, make_env, physics, policies, first=first) if config.asynchronous else env,
             twin,
             model_free=policies["model_free"],
             model_based=policies["model_based"],
@@ -246,8 +243,6 @@ class Run:
 
     def _train(self) -> dict[str, Any]:
         self._held.begin(self.config)
-        if not self._held.resumes():
-            (self.folder / EVENTS).unlink(missing_ok=True)
         options = flat(as_written(self.config))
         loggers = make_loggers(self.config.loggers, self.folder, self.algorithm.twin.plant.name)
         dashboard = Dashboard(self.folder, loggers)
@@ -334,7 +329,7 @@ class Run:
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
-        dashboard.episode(record, self.episodes[0], self.algorithm.policies)
+        dashboard.episode(record, self.algorithm.policies)
         due = self.config.figures and len(self.episodes) % FIGURES_EVERY == 0
         if due and len(self.episodes) < self.config.episodes:
             safe_point()

@@ -6,7 +6,6 @@ import io
 import os
 import pickle
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,8 +46,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 def load_tensors(path: Path) -> dict[str, Any]:
     """The content that :func:`save_tensors` wrote, on the CPU.
 
-    The checksum of the whole file (SHA-256) is compared first, and those of its parts (CRC-32), which files of earlier
-    versions have alone.
+    The checksum of the whole file (SHA-256) is compared first.
 
     Raises:
         DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
@@ -67,10 +65,7 @@ def _loaded(path: Path) -> dict[str, Any]:
     file = path.read_bytes()
     try:
         _verify(file)
-    except MemoryError:
-        raise
-    # The kind of error depends on the byte that is wrong, and all of them come from the content of the file.
-    except Exception as error:
+    except ValueError as error:
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
     try:
         content = torch.load(io.BytesIO(file), weights_only=True, map_location="cpu")
@@ -81,7 +76,7 @@ def _loaded(path: Path) -> dict[str, Any]:
             f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
             f"in plain containers. {first_line(error)}"
         ) from error
-    except Exception as error:  # of as many kinds
+    except Exception as error:  # of many kinds
         if "allocate memory" in str(error):  # torch has no class of its own for it on the CPU
             raise MemoryError from error
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
@@ -97,28 +92,17 @@ def _sealed(archive: bytes) -> bytes:
 
 
 def _verify(file: bytes) -> None:
-    """Compare the SHA-256 of a sealed archive, or the CRC-32 of the parts of one without a seal.
+    """Compare the SHA-256 of a sealed archive.
 
     Raises:
-        zipfile.BadZipFile: if a checksum is wrong, or parts would take more memory than the file has bytes; a run
-            compresses nothing.
+        ValueError: if the archive has no seal, or another checksum.
     """
     length = len(SEAL) + 64
     end = file[-length:]
-    if end.startswith(SEAL):
-        if hashlib.sha256(file[: -length - 2] + b"\0\0").hexdigest().encode() != end[len(SEAL) :]:
-            raise zipfile.BadZipFile("it does not have the checksum that it was written with")
-        return
-    if file[-2:] != b"\0\0":  # the length of the comment, with which an archive without one ends
-        raise zipfile.BadZipFile("its end is not that of a file of a run")
-    with zipfile.ZipFile(io.BytesIO(file)) as archive:
-        parts = archive.infolist()
-        if sum(part.file_size for part in parts) > len(file):
-            raise zipfile.BadZipFile(f"its parts are larger than its {len(file)} bytes")
-        if any(part.external_attr for part in parts):  # for a folder, torch gives memory that nobody has written
-            raise zipfile.BadZipFile("a part of it has attributes, which a run does not write")
-        if (wrong := archive.testzip()) is not None:
-            raise zipfile.BadZipFile(f"its part {wrong} does not have its checksum")
+    if not end.startswith(SEAL):
+        raise ValueError("it has no checksum at its end")
+    if hashlib.sha256(file[: -length - 2] + b"\0\0").hexdigest().encode() != end[len(SEAL) :]:
+        raise ValueError("it does not have the checksum that it was written with")
 
 
 def first_line(error: Exception) -> str:

@@ -5,14 +5,12 @@ import functools
 import importlib
 import importlib.metadata
 import importlib.util
-import itertools
 import json
 import platform
 import shlex
 import sys
 import time
 from collections.abc import Set as AbstractSet
-from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,7 +23,8 @@ RAN = "ran"
 """Key of the list with an entry for every start of the run."""
 BESIDE = ("plant", "recipe", RAN)
 """Keys of ``config.json`` that are not options."""
-LIBRARY = __name__.partition(".")[0]
+OWN_CLASS: dict[str, str | None] = {"class": "RunConfig", "file": None}
+"""What a run with the configuration of this library itself names in the place of a recipe."""
 OF_EVERY_RUN = frozenset(option.name for option in dataclasses.fields(RunConfig))
 GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
 
@@ -39,7 +38,7 @@ def settings_of(config: RunConfig, plant: str) -> dict[str, Any]:
 
     Returns:
         Every option; ``plant``; and ``recipe``, the place where the class of the configuration is defined, with
-        ``class``, ``module`` (null for a script) and ``file`` (null for an interactive session).
+        ``class`` and ``file`` (null for an interactive session).
     """
     return dataclasses.asdict(config) | {"plant": plant, "recipe": _origin(type(config))}
 
@@ -50,7 +49,7 @@ def task_of(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """The result of :func:`settings_of` when the run of a folder was made; runs of version 0.1 have no ``recipe``.
+    """The result of :func:`settings_of` when the run of a folder was made.
 
     Raises:
         ValueError: if the folder is not a run folder, or its settings are damaged.
@@ -71,34 +70,31 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
-    """The configuration class that the settings of a run name, from its module, which is imported.
+    """The configuration class that the settings of a run name, from the file that defines it, which is run.
 
-    What is imported is a file outside the run folder or, without one, a module of this library. Any other name of a
-    module may lead into the run folder, which comes from somewhere else and may be the current folder.
+    A file in the run folder is not run, because the folder comes from somewhere else.
 
     Raises:
-        ValueError: if the settings name no class, or the name is not found any more, belongs to no configuration, or
-            may be defined in the run folder itself.
+        ValueError: if the settings name no class, the class is not found any more or belongs to no configuration, or
+            its file lies in the run folder.
     """
     origin: Any = settings.get("recipe")
     place = folder / FILE
+    if origin == OWN_CLASS:
+        return RunConfig
     try:
-        name, module, file = (origin[key] for key in ("class", "module", "file"))
+        name, file = origin["class"], origin["file"]
     except (TypeError, KeyError):
-        name = module = file = 0
-    if not isinstance(name, str) or not all(part is None or isinstance(part, str) for part in (module, file)):
+        name = file = 0
+    if not isinstance(name, str) or not isinstance(file, str | None):
         raise ValueError(f"{place} does not say which recipe made the run; {GIVE}.")
-    if "<locals>" in name or not (module or file):
+    if "<locals>" in name or not file:
         raise ValueError(f"the class {name} that made the run in {folder} was defined on the way; {GIVE}.")
-    if file and (not Path(file).is_absolute() or _lies_in(file, folder)):
+    path = Path(file)
+    if not path.is_absolute() or path.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"recipe {file} in {place} is not run: it came with the folder. To trust it, {GIVE}.")
-    if module and module.partition(".")[0] != LIBRARY and not (file and Path(file).is_file()):
-        raise ValueError(
-            f"module {module} in {place} is not imported, because its file {file or '(none is named)'} is not there, "
-            f"and a module of this name may have come with the folder. To trust it, {GIVE}."
-        )
     try:
-        return require_config(attribute(_module(module, file, folder), name), name)
+        return require_config(attribute(module_of(path), name), name)
     except (ValueError, ImportError) as error:
         raise ValueError(f"the recipe that {place} names is not found: {error} If it has moved, {GIVE}.") from error
 
@@ -119,51 +115,10 @@ def require_config(found: Any, name: str) -> type[RunConfig]:
 
 
 def _origin(config_class: type) -> dict[str, str | None]:
-    module = sys.modules.get(config_class.__module__)
-    file = getattr(module, "__file__", None)
-    name: str | None = config_class.__module__
-    if name == "__main__":
-        name = getattr(getattr(module, "__spec__", None), "name", None)  # a script has none, python -m has one
-    if file and name and name.startswith(PREFIX):
-        name = None
-    return {"class": config_class.__qualname__, "module": name, "file": str(Path(file).resolve()) if file else None}
-
-
-def _module(name: str | None, file: str | None, folder: Path) -> ModuleType:
-    """The module of a recipe: imported by its name if the name leads to the file or the file is missing, else by file.
-
-    A script that is running is not run again.
-    """
-    for loaded in (sys.modules.get("__main__"), sys.modules.get(name or "")):
-        if file and loaded and _same(getattr(loaded, "__file__", None), file):
-            return loaded
-    if name and (not file or not Path(file).is_file() or _same(_found(name, folder), file)):
-        return importlib.import_module(name)
-    if not file:
-        raise ValueError("neither a module nor a file of it is named.")
-    return module_of(Path(file))
-
-
-def _found(name: str, folder: Path) -> str | None:
-    """The file of a module, None if there is none or if a package on the way to it lies in the run folder.
-
-    Unlike ``importlib.util.find_spec``, the search imports none of these packages.
-    """
-    places, origin = None, None
-    for package in itertools.accumulate(name.split("."), "{}.{}".format):
-        spec = PathFinder.find_spec(package, places)
-        if spec is None or (spec.origin and _lies_in(spec.origin, folder)):
-            return None
-        places, origin = spec.submodule_search_locations or (), spec.origin
-    return origin
-
-
-def _lies_in(file: str, folder: Path) -> bool:
-    return Path(file).resolve().is_relative_to(folder.resolve())
-
-
-def _same(one: str | None, other: str) -> bool:
-    return one is not None and Path(one).resolve() == Path(other).resolve()
+    if config_class is RunConfig:
+        return OWN_CLASS
+    file = getattr(sys.modules.get(config_class.__module__), "__file__", None)
+    return {"class": config_class.__qualname__, "file": str(Path(file).resolve()) if file else None}
 
 
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
@@ -245,13 +200,11 @@ def differences(folder: Path, asked: RunConfig, harmless: AbstractSet[str] = HAR
     """
     its = flat(read_settings(folder))
     asks = flat(as_written(asked))
-    defaults = flat(as_written(type(asked)()))
     found = []
     for name in sorted(its.keys() | asks.keys()):
         if name.split(".")[0] in {*harmless, *BESIDE}:
             continue
-        # A run of an earlier version had, for an option that is new since then, the value that is now its default.
-        was, now = its.get(name, defaults.get(name, ABSENT)), asks.get(name, ABSENT)
+        was, now = its.get(name, ABSENT), asks.get(name, ABSENT)
         if was != now:
             found.append(f"{name} is {now} here and was {was} in the run")
     return found
@@ -275,15 +228,21 @@ PREFIX = "rt_torchrl_recipe_"
 def module_of(file: Path) -> ModuleType:
     """The module in a file, imported only once; as a script does, it can import modules that lie beside the file.
 
+    A script that is running is not run again.
+
     Raises:
         ValueError: if there is no such file, or it does not end in ``.py``.
     """
     if not file.is_file():
         raise ValueError(f"{file} does not exist; give a file with Python code.")
-    return _imported(file.resolve())
+    file = file.resolve()
+    for loaded in list(sys.modules.values()):
+        place = getattr(loaded, "__file__", None)
+        if place and Path(place).name == file.name and Path(place).resolve() == file:
+            return loaded
+    return _imported(file)
 
 
-@functools.cache
 def _imported(file: Path) -> ModuleType:
     if str(file.parent) not in sys.path:
         sys.path.insert(0, str(file.parent))

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
@@ -380,10 +380,7 @@ def served_system(
     protocol: Literal["opcua", "modbus"] = "opcua",
     port: int = 4840,
     period: float | None = None,
-    served: Plant | None = None,
-    closure: nn.Module | None = None,
     log: Path | None = None,
-    patience: float = 60.0,
 ) -> RealSystem:
     """The real system at the other end of a protocol. The connection is made at the first reset.
 
@@ -393,38 +390,26 @@ def served_system(
         protocol: what the server speaks.
         port: port of the server on the local machine.
         period: control period on the wall clock [s]; by default the plant's control interval.
-        served: plant at the other end, if it does not serve all states of ``plant``, such as past observations; the
-            :attr:`Plant.controller_states` are then computed here, see :class:`RealSystem`.
-        closure: the true closure, if policies are to be judged in simulation; else None.
         log: file of the safety layer's events.
-        patience: time for which a reset waits for the plant to answer [s].
 
     Raises:
-        ValueError: if the served plant does not serve a state that is measured, or there is no such protocol or its
-            package.
+        ValueError: if there is no such protocol or its package.
     """
-    computed = () if served is None else plant.controller_states
-    measured = tuple(state for state in plant.readings if state.name not in computed)
-    other, wall = served or plant, plant.dt if period is None else period
-    missing = {state.name for state in measured} - {state.name for state in other.readings}
-    if missing:
-        raise ValueError(f"served={other.name!r} lacks {', '.join(sorted(missing))}, which plant {plant.name!r} reads.")
-    tags = tags_of(other)
+    wall = plant.dt if period is None else period
+    tags = tags_of(plant)
     commands = tags.pop("commands")
-    entries = tags | {"state": tuple(f"state.{state.name}" for state in measured)}
     for package in ("asyncua", "pymodbus"):
         logging.getLogger(package).setLevel(logging.CRITICAL)  # a rehearsal loses connections, which the link notes
     env = ConnectedPlant(
-        link_to(protocol, other, port, period=wall),
-        {key: names for key, names in entries.items() if names},
+        link_to(protocol, plant, port, period=wall),
+        {key: names for key, names in tags.items() if names},
         commands,
         plant.actions,
         period=wall,
         sample="sample",
         answered="answered",
-        patience=patience,
     )
-    low, high = [state.low for state in measured], [state.high for state in measured]
+    low, high = [state.low for state in plant.readings], [state.high for state in plant.readings]
     ranges = {"skipped": NONE} | ({"state": (low, high)} if any(map(math.isfinite, (*low, *high))) else {})
     guarded = SafetyLayer(env, SafetyConfig(interval=plant.dt, ranges=ranges, log=log), fallback=tuple(safe))
     return RealSystem(
@@ -433,7 +418,5 @@ def served_system(
         state=Reading(keys=("state",)),
         exogenous=Reading(keys=("exogenous",)) if plant.inputs else None,
         applied=Reading(keys=("applied",)),
-        closure=closure,
-        computes=served is not None,
         seed=None,
     )

@@ -4,12 +4,10 @@ A system in operation acts on while the algorithm learns; docs/connect_your_mach
 """
 
 import copy
-import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -86,17 +84,12 @@ class Operation(ABC):
     what the safety layer did in the window taken last, and ``acted`` numbers about what acted at its end, if there are
     any. ``version`` is the number of the latest order, -1 before the first.
 
-    ``log`` names a file of events, one JSON object per line: ``taken``, the learner has taken the ``window``, which
-    ``versions`` flew in turn; ``handed over``, it has handed a ``version`` over; and ``resumed``, the run goes on with
-    this window and version after a stop, and what came after them is lost.
-
     Args:
         system: the real system as the learner knows it.
-        log: file of the events; None writes none.
     """
 
-    def __init__(self, system: EnvBase, log: Path | None = None):
-        self.system, self.version, self.taken, self._log = system, -1, 0, log
+    def __init__(self, system: EnvBase):
+        self.system, self.version = system, -1
         self.orders: dict[int, Order] = {}
         self.report: SafetyReport | None = None
         self.acted: Mapping[str, float] | None = None
@@ -122,7 +115,6 @@ class Operation(ABC):
         order = Order(self.version + 1, name, weights, strength, found)
         self._pass_on(order)
         self.version, self.orders[order.version] = order.version, order
-        self._note("handed over", version=self.version)
 
     @abstractmethod
     def _pass_on(self, order: Order) -> None:
@@ -152,33 +144,24 @@ class Operation(ABC):
             acting: version that acts at its end.
         """
         entries, self.report, self.acted = window.entries, window.report, window.acted
-        versions = [] if entries is None else list(dict.fromkeys(entries["version"].flatten().tolist()))
+        versions = [] if entries is None else entries["version"].flatten().tolist()
         oldest = min([acting, *versions])
         self.orders = {version: order for version, order in self.orders.items() if version >= oldest}
-        self._note("taken", window=self.taken, versions=versions)
-        self.taken += 1
         if window.ended is not None or entries is None:
             raise EpisodeEndedError(window.ended or "the window holds no interval", entries)
         return entries
-
-    def _note(self, event: str, **values: Any) -> None:
-        if self._log is not None:
-            with self._log.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"event": event, **values}) + "\n")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on, in tensors and plain containers."""
         return {
             "orders": [order._asdict() for order in self.orders.values()],
             "version": self.version,
-            "taken": self.taken,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of an operation that was built with the same arguments."""
         self.orders = {order["version"]: Order(**order) for order in state["orders"]}
-        self.version, self.taken = state["version"], state["taken"]
-        self._note("resumed", window=self.taken, version=self.version)
+        self.version = state["version"]
 
 
 def system_of(env: EnvBase | Operation) -> EnvBase:
@@ -477,16 +460,15 @@ class SimulatedOperation(Operation):
     Args:
         operator: what acts.
         learning: time from taking a window to handing the next policy over, in control intervals.
-        log: file of the events.
 
     Raises:
         ValueError: if ``learning`` is negative.
     """
 
-    def __init__(self, operator: Operator, *, learning: int, log: Path | None = None):
+    def __init__(self, operator: Operator, *, learning: int):
         if learning < 0:
             raise ValueError(f"learning={learning} control intervals must not be negative.")
-        super().__init__(operator.env, log)
+        super().__init__(operator.env)
         self.operator, self._learning = operator, learning
         self._coming: dict[int, int] = {}  # interval in which each version takes over
         self._now = 0

@@ -7,7 +7,6 @@ import signal
 import sys
 import threading
 from multiprocessing.connection import Connection
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -41,13 +40,12 @@ class ProcessOperation(Operation):
     Args:
         crew: what acts.
         system: the real system as the learner knows it, made by the same function; it is never stepped here.
-        log: file of the events.
 
     Raises:
         ValueError: if something that acts cannot be sent to another process.
     """
 
-    def __init__(self, crew: Crew, system: EnvBase, *, log: Path | None = None):
+    def __init__(self, crew: Crew, system: EnvBase):
         try:
             self._parts = pickle.dumps(crew)
         except Exception as error:  # pickle raises many kinds
@@ -55,7 +53,7 @@ class ProcessOperation(Operation):
                 f"what acts cannot be sent to a process of its own ({type(error).__name__}: {error}); use the "
                 "simulated clock, --operation.clock simulated, or policies and systems that pickle."
             ) from error
-        super().__init__(system, log)
+        super().__init__(system)
         self._state: dict[str, Any] | None = None
         self._connection: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
