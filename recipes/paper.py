@@ -34,8 +34,9 @@ from rt_torchrl import (
 from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
-from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, LongTermMemory, ScaledPolicy
+from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, ActorCritic, Critic, LongTermMemory, ScaledPolicy
 from rt_torchrl.steps.report import weight_change
+from rt_torchrl.steps.switch import STALL
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 
@@ -125,7 +126,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
                 live, idle = idle, live
         else:
             worse = 0
-            stalled = stalled + 1 if change < referee.stall else 0
+            stalled = stalled + 1 if change < STALL else 0
             if stalled > referee.clone_patience:
                 event, stalled = "clone", 0
                 policies[idle].load_state_dict(policies[live].state_dict())
@@ -145,10 +146,10 @@ class DDPG:
     """π_mf, its critic q and the memory D_L; line 17 has no target network, and relaxes the critic itself."""
 
     def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, generator: torch.Generator):
-        self.config, self.memory = config, LongTermMemory(config.memory_capacity, correction=0.0, generator=generator)
+        self.config, self.memory = config, LongTermMemory(correction=0.0, generator=generator)
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.actor = ScaledPolicy(plant, policy, stochastic=False, device=generator.device)
-        widths = (len(plant.observations) + len(plant.actions), *config.critic_hidden)
+        widths = (len(plant.observations) + len(plant.actions), *ActorCritic.critic_hidden)
         self.critic = Critic(widths, generator=generator)
         self.loss = DDPGLoss(
             TensorDictModule(self.actor, ["observation"], ["action"]),
@@ -160,7 +161,7 @@ class DDPG:
         named = [(name, weight) for name, weight in self.loss.named_parameters() if weight.requires_grad]
         self.w_q = [weight for name, weight in named if "value_network" in name]
         self.w_a = [weight for name, weight in named if "value_network" not in name]
-        self.critic_adam = torch.optim.Adam(self.w_q, config.critic_rate, fused=True)
+        self.critic_adam = torch.optim.Adam(self.w_q, ActorCritic.critic_rate, fused=True)
         self.restart()
 
     def restart(self) -> None:

@@ -26,7 +26,15 @@ from peers import Environment, Learned
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
-from rt_torchrl import DigitalTwin, ExplorationConfig, LearnerConfig, PlantEnv, ReinforcementTwinning, TwinningConfig
+from rt_torchrl import (
+    ActorCritic,
+    DigitalTwin,
+    ExplorationConfig,
+    LearnerConfig,
+    PlantEnv,
+    ReinforcementTwinning,
+    TwinningConfig,
+)
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -35,7 +43,7 @@ from rt_torchrl.plants.policies import SaturatedMLP
 
 ALGORITHMS = ("ddpg", "td3", "sac")
 EPISODES = 20
-RATES = {"critic_rate": 1e-3, "actor_rate": 1e-3, "target_rate": 0.02}
+RATES = {"actor_rate": ActorCritic.critic_rate, "target_rate": 0.02}
 SYSTEMS = {
     "pendulum": (
         Pendulum(),
@@ -56,7 +64,7 @@ SYSTEMS = {
 def of_this_library(plant, real, exploration, learner, seed):
     """A policy of the arm ``model_free``."""
     generator = torch.Generator().manual_seed(seed)
-    widths = {"hidden": learner.critic_hidden, "generator": generator}
+    widths = {"hidden": ActorCritic.critic_hidden, "generator": generator}
     policies = [SaturatedMLP(len(plant.observations), plant.actions, **widths) for _ in range(2)]
     training = ReinforcementTwinning(
         real(plant, seed=seed),
@@ -78,7 +86,7 @@ def of_stable_baselines3(plant, real, exploration, learner, seed):
     agent = getattr(stable_baselines3, learner.algorithm.upper())(
         "MlpPolicy",
         gymnasium.wrappers.TransformReward(env, lambda reward: learner.reward_scale * reward),
-        learning_rate=learner.critic_rate,
+        learning_rate=ActorCritic.critic_rate,
         learning_starts=0,
         batch_size=learner.batch_size,
         tau=learner.target_rate,
@@ -86,7 +94,7 @@ def of_stable_baselines3(plant, real, exploration, learner, seed):
         train_freq=(1, "episode"),
         gradient_steps=learner.critic_iterations,
         n_steps=learner.return_steps,
-        policy_kwargs={"net_arch": list(learner.critic_hidden), "activation_fn": nn.SiLU},
+        policy_kwargs={"net_arch": list(ActorCritic.critic_hidden), "activation_fn": nn.SiLU},
         seed=seed,
         device="cpu",
         **({} if learner.algorithm == "sac" else noise),

@@ -13,15 +13,9 @@ SMALL = TwinningConfig(
     realisations=2,
     virtual_episodes=2,
     exploration=ExplorationConfig(episodes=2),
-    learner=LearnerConfig(
-        critic_iterations=3,
-        actor_iterations=3,
-        batch_size=8,
-        critic_hidden=(8,),
-        memory_capacity=500,
-    ),
+    learner=LearnerConfig(critic_iterations=3, actor_iterations=3, batch_size=8),
     # No patience, so that swaps and clones happen within the few episodes of a test.
-    referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),
+    referee=RefereeConfig(patience=0, clone_patience=0),
 )
 
 

@@ -22,7 +22,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 
 
-LEARNING = LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,))
+LEARNING = LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16)
 IDLE = dataclasses.replace(LEARNING, critic_iterations=0, actor_iterations=0)
 """A learner without iterations, whose tracing takes longer than all else in a short episode."""
 
@@ -183,7 +183,7 @@ def test_swap_changes_who_acts_and_copies_nothing():
 
 @pytest.mark.parametrize("live", ["model_free", "model_based"])
 def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
-    found = twinning(learner=LEARNING, referee=RefereeConfig(clone_patience=0, stall=1e9))
+    found = twinning(learner=LEARNING, referee=RefereeConfig(clone_patience=0))
     found.referee.live = live
     episode = flown(found, *STEPS[:-1])
     optimisers = {

@@ -89,7 +89,7 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
 
 
 def two_architectures(**options):
-    options = {"learner": LEARNING, "referee": RefereeConfig(clone_patience=0, stall=1e9), **options}
+    options = {"learner": LEARNING, "referee": RefereeConfig(clone_patience=0), **options}
     policies = {"model_free": perceptron(), "model_based": affine([-0.8, -1.1])}
     return twinning(PLANT, seed=9, closure=LinearClosure(PLANT.true_closure), **policies, **options)
 

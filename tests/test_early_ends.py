@@ -158,7 +158,7 @@ def test_both_collectors_fly_the_same_episode_to_its_end():
 
 def test_sums_of_rewards_end_with_the_known_value_of_the_end():
     plant = Falling()
-    config = LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, critic_hidden=(8,), batch_size=8)
+    config = LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, batch_size=8)
     learner = ActorCritic(plant, LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
     episode = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, LinearGain(WEAK)), plant).rollout()[0]
     found, n = learner.transitions(episode), len(episode)

@@ -47,9 +47,25 @@ POLICIES = {
 }
 
 
-def learner(algorithm="ddpg", seed=0, policy="gain", method=None, **options):
-    options = {"algorithm": algorithm, "discount": GAMMA, "critic_hidden": (16,), "batch_size": 32, **options}
-    return ActorCritic(PLANT, POLICIES[policy](), LearnerConfig(**options), generator=seeded(seed), method=method)
+class Narrow(ActorCritic):
+    critic_hidden = (16,)
+
+
+class Tapering(ActorCritic):
+    critic_hidden = (16, 8)
+
+
+class Quick(ActorCritic):
+    critic_rate = 3e-3
+
+
+class Wild(Narrow):
+    critic_rate = 1e308
+
+
+def learner(algorithm="ddpg", seed=0, policy="gain", method=None, kind=Narrow, **options):
+    options = {"algorithm": algorithm, "discount": GAMMA, "batch_size": 32, **options}
+    return kind(PLANT, POLICIES[policy](), LearnerConfig(**options), generator=seeded(seed), method=method)
 
 
 def explored(count, seed=0, spread=1.5):
@@ -151,7 +167,7 @@ def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, ret
 @pytest.mark.parametrize("algorithm", [name for name in METHODS if name != "relaxed_ddpg"])
 def test_an_iteration_takes_the_steps_of_torchs_adam(algorithm):
     """Also with several critics, whose gradients lie in memory in another order than their weights."""
-    ours, others = (learner(algorithm, policy="perceptron", critic_hidden=(16, 8)) for _ in range(2))
+    ours, others = (learner(algorithm, policy="perceptron", kind=Tapering) for _ in range(2))
     ours.store(explored(20)), others.store(explored(20))
     keys, (batch,) = batches_of(ours, 1)
     torch.manual_seed(0)
@@ -282,10 +298,10 @@ def test_a_transition_that_is_not_finite_is_refused_by_name(algorithm, key, valu
     assert_equal(found.state_dict()["loss"], before["loss"])
 
 
-@pytest.mark.parametrize(("algorithm", "rate"), [("ddpg", "critic_rate"), ("sac", "actor_rate")])
-def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(algorithm, rate):
+@pytest.mark.parametrize(("algorithm", "rates"), [("ddpg", {"kind": Wild}), ("sac", {"actor_rate": 1e308})])
+def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(algorithm, rates):
     """A second step of 1e308 overflows."""
-    found = learner(algorithm, **{rate: 1e308, "critic_iterations": 6, "actor_iterations": 3})
+    found = learner(algorithm, critic_iterations=6, actor_iterations=3, **rates)
     found.store(explored(20))
     before = copy.deepcopy(found.state_dict()), copy.deepcopy(found.policy.state_dict())
     report = found.update()
@@ -430,8 +446,7 @@ def test_all_is_drawn_from_the_learners_generator(algorithm):
 def test_policy_finds_the_optimal_gain(algorithm, updates, spread, options, unchecked):
     """On 5000 transitions of a noise-free plant."""
     best = optimal_gain(GAMMA)
-    critic = {"critic_hidden": (64, 64), "critic_iterations": 100, "critic_rate": 3e-3, "target_rate": 0.05}
-    found = learner(algorithm, batch_size=256, **critic, **options)
+    found = learner(algorithm, kind=Quick, batch_size=256, critic_iterations=100, target_rate=0.05, **options)
     start, data = found.policy.gain.detach().numpy().copy(), explored(1000, spread=spread)
     filled(data, found, prioritisation=0.0)
     for _ in range(updates):
@@ -459,7 +474,7 @@ def episode(n):
 
 
 def summing(return_steps, discount=0.5, **options):
-    return learner(return_steps=return_steps, discount=discount, critic_hidden=(8,), **options)
+    return learner(return_steps=return_steps, discount=discount, **options)
 
 
 def test_rewards_are_summed_over_whole_windows_only():

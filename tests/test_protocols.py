@@ -22,7 +22,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)
-SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16, "critic_hidden": (8,)}
+SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}
 
 
 def actor_critic(algorithm, policy):

@@ -98,7 +98,7 @@ def test_resume_and_overwrite_exclude_each_other(tmp_path):
 
 def changed_twinning():
     default = RunConfig().twinning
-    rates = dataclasses.replace(default.learner, critic_rate=2e-3, discount=0.5)
+    rates = dataclasses.replace(default.learner, actor_rate=1e-3, discount=0.5)
     return dataclasses.replace(default, learner=rates)
 
 
@@ -109,7 +109,7 @@ def changed_twinning():
         ({"engine": "autograd"}, "engine is autograd here and was native in the run"),
         ({"quick": True}, "quick is True here and was False in the run"),
         ({"hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
-        ({"twinning": changed_twinning()}, "critic_rate is 0.002 here and was 0.001.*learner.discount is 0.5"),
+        ({"twinning": changed_twinning()}, "actor_rate is 0.001 here and was 0.002.*learner.discount is 0.5"),
     ],
 )
 def test_a_run_is_not_resumed_with_other_options(tmp_path, options, named):

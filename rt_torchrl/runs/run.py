@@ -86,8 +86,8 @@ class Run:
             baselines then.
         learner: function of plant, policy, ``config.twinning.learner`` and ``generator=`` that makes the learner of
             step 2, such as a :class:`Learner` of one's own or :class:`ActorCritic` with a loss of one's own.
-        replay: function of ``config.twinning.learner.memory_capacity``, ``correction=`` and ``generator=`` that makes
-            the memory of :class:`ActorCritic`, if there is no ``learner``.
+        replay: function of ``correction=`` and ``generator=`` that makes the memory of :class:`ActorCritic`, if there
+            is no ``learner``.
         planner: function of twin, policy and ``config.twinning.planner`` that makes the planner of step 5, a
             :class:`Planner`.
         referee: function of ``config.twinning.referee`` and the role that starts live that makes the referee of step 6,

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.options import AtLeastOne, Count, NotNegative, Positive, Unbounded, Widths, configuration
+from rt_torchrl.options import AtLeastOne, Count, NotNegative, Positive, Unbounded, configuration
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 
@@ -43,10 +43,7 @@ class LearnerConfig:
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
             scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
         target_rate: rate τ at which the targets follow, or share of its step that a relaxed critic takes.
-        critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
-        critic_hidden: widths of the critic's hidden layers.
-        memory_capacity: number n_L of transitions that the long-term memory D_L keeps.
     """
 
     algorithm: LearnerName = "ddpg"
@@ -57,10 +54,7 @@ class LearnerConfig:
     return_steps: AtLeastOne = 1
     reward_scale: Positive = 1.0
     target_rate: Positive = 0.01
-    critic_rate: Positive = 1e-3
     actor_rate: Positive = 2e-3
-    critic_hidden: Widths = (64, 64)
-    memory_capacity: AtLeastOne = 100_000
 
 
 @configuration
@@ -158,13 +152,11 @@ class RefereeConfig:
         patience: number P_π of episodes in a row that a reason to swap must outlast, in the decision tree.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.
-        stall: relative weight change T_w below which the idle policy has stalled.
     """
 
     rule: RefereeName = "expected_cost"
     patience: Count = 2
     clone_patience: Count = 3
-    stall: Positive = 0.5
 
 
 @configuration

@@ -232,12 +232,17 @@ class ActorCritic:
         config: parameters of step 2.
         generator: source of the critics' initial weights and of the samples.
         method: the method, for a loss of one's own; by default the one that ``config.algorithm`` names.
-        replay: function of ``config.memory_capacity``, ``correction=`` of the method and ``generator=`` that makes the
-            memory, with the methods of :class:`LongTermMemory`.
+        replay: function of ``correction=`` of the method and ``generator=`` that makes the memory, with the methods of
+            :class:`LongTermMemory`.
 
     Raises:
         ValueError: if ``return_steps`` exceeds an episode of the plant.
     """
+
+    critic_hidden: Sequence[int] = (64, 64)
+    """Widths of the critics' hidden layers."""
+    critic_rate = 1e-3
+    """Learning rate of the critics (Adam). ``reward_scale`` suits it to the costs of a system."""
 
     def __init__(
         self,
@@ -258,10 +263,10 @@ class ActorCritic:
         self.method = method or METHODS[config.algorithm]
         self.batch_size = min(config.batch_size, plant.n_steps)
         correction = self.method.correction
-        self.memory = (replay or LongTermMemory)(config.memory_capacity, correction=correction, generator=generator)
+        self.memory = (replay or LongTermMemory)(correction=correction, generator=generator)
         stochastic, n_a = self.method.stochastic, len(plant.actions)
         self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
-        widths = (len(plant.observations) + n_a, *config.critic_hidden)
+        widths = (len(plant.observations) + n_a, *self.critic_hidden)
         critics = [
             ValueOperator(
                 Critic(widths, normalised=self.method.normalised, generator=generator),
@@ -279,7 +284,7 @@ class ActorCritic:
         targets = any(name.startswith("target_") for name, _ in self.loss.named_buffers())
         self.target = SoftUpdate(self.loss, tau=config.target_rate) if targets else None
         named = [(name, w) for name, w in self.loss.named_parameters() if w.requires_grad]
-        self.critic_adam = Adam([w for name, w in named if "value_network" in name], config.critic_rate)
+        self.critic_adam = Adam([w for name, w in named if "value_network" in name], self.critic_rate)
         self.actor_adam = Adam([w for name, w in named if "value_network" not in name], config.actor_rate)
         self.shortest = config.return_steps
         """Least number of control intervals in a row that can be stored."""
@@ -635,14 +640,19 @@ class LongTermMemory:
     It stands on the CPU.
 
     Args:
-        capacity: number n_L of transitions that the memory keeps.
+        capacity: number n_L of transitions that the memory keeps, by default of all episodes of most trainings.
         prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
         correction: exponent of the importance weights.
         generator: source of the samples.
     """
 
     def __init__(
-        self, capacity: int, *, prioritisation: float = 0.6, correction: float = 0.4, generator: torch.Generator
+        self,
+        capacity: int = 100_000,
+        *,
+        prioritisation: float = 0.6,
+        correction: float = 0.4,
+        generator: torch.Generator,
     ):
         self.capacity, self.prioritisation, self.correction = capacity, prioritisation, correction
         self._generator = generator
@@ -716,7 +726,7 @@ class LongTermMemory:
 
 
 MakeReplay = Callable[..., LongTermMemory]
-"""Function of the capacity, ``correction=`` and ``generator=`` that makes a :class:`LongTermMemory`."""
+"""Function of ``correction=`` and ``generator=`` that makes a :class:`LongTermMemory`."""
 
 
 class LeastPriorityWriter(RoundRobinWriter):

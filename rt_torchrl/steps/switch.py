@@ -17,6 +17,8 @@ from rt_torchrl.steps.plan import Planner
 from rt_torchrl.steps.report import Step, findings, merged, record_of
 
 Event = Literal["keep", "swap", "clone"]
+STALL = 0.5
+"""Relative weight change T_w below which the idle policy has stalled; P_w decides how soon that makes it a clone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +103,7 @@ class ExpectedCost:
 
     def _stalled(self, idle_weight_change: float) -> Event:
         """Count stalled episodes: ``clone`` if there are more in a row than ``clone_patience``, else ``keep``."""
-        self.stall_count = self.stall_count + 1 if idle_weight_change < self.config.stall else 0
+        self.stall_count = self.stall_count + 1 if idle_weight_change < STALL else 0
         if self.stall_count > self.config.clone_patience:
             self.stall_count = 0
             return "clone"
@@ -206,7 +208,8 @@ class Switch(Step):
         evidence = Evidence(
             live_cost=costs[live].expected,
             idle_cost=costs[idle].expected,
-            idle_weight_change=episode["weight_changes", idle].item(),
+            # Weights whose step was left out, because the twin diverged, are as they were.
+            idle_weight_change=float(episode.get(("weight_changes", idle), 0.0)),
             real_costs=tuple(one.cost for one in self.belief.flown),
         )
         event = self.referee.decide(evidence)
