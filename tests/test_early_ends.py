@@ -286,7 +286,7 @@ def test_a_plant_that_ends_at_no_cost_is_refused():
 def test_windows_of_operation_are_refused(tmp_path):
     config = RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
     with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
-        operation_of(config, PlantEnv(Falling()), None, Falling(), {}, folder=tmp_path)
+        operation_of(config, PlantEnv(Falling()), None, Falling(), {})
 
 
 def test_the_plant_of_the_documentation_breaks_its_rod():
