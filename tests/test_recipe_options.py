@@ -64,9 +64,9 @@ def test_options_out_of_range_are_refused(plant, options, message):
 def test_a_weight_of_another_task_is_refused():
     made = recipe("wind_turbine")
     assert made.Config(task="engineering").plant().cost == made.EngineeringCost()
-    asked = made.Config(task="engineering", pitch_rate_weight=0.1)
-    assert asked.plant().cost == made.EngineeringCost(pitch_rate=0.1)
-    with pytest.raises(ValueError, match="pitch_rate_weight is one of the task engineering"):
+    asked = made.Config(task="engineering", pitch_rate_weight=0.1, torque_rate_weight=1.0)
+    assert asked.plant().cost == made.EngineeringCost(pitch_rate=0.1, torque_rate=1.0)
+    with pytest.raises(ValueError, match="rate weights are those of the task engineering"):
         made.Config(pitch_rate_weight=0.1)
 
 
