@@ -36,7 +36,7 @@ from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindT
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
-from rt_torchrl.options import NotNegative, Text
+from rt_torchrl.options import Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,9 +92,8 @@ class Config(RunConfig):
             measured+wind, preview (these and the wind in 2, 4 and 8 s, as a lidar measures it), or names such as
             rotor_speed; by default measured+wind for mlp, scheduled for scheduled, and else paper.
         task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
-            overspeed, overshoot, and the rates of pitch and torque).
-        pitch_rate_weight: weight w_β of the rate of pitch in the cost of the task engineering.
-        torque_rate_weight: weight w_τ of the rate of torque in the cost of the task engineering.
+            overspeed, overshoot, the rates of pitch and torque and, by engineering.underspeed, a slow rotor in wind).
+        engineering: weights of the task engineering.
         dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         wind_files: TurbSim files (.hh or .bts) from which the wind is drawn instead.
@@ -112,8 +111,7 @@ class Config(RunConfig):
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
-    pitch_rate_weight: NotNegative = 0.01
-    torque_rate_weight: NotNegative = 0.01
+    engineering: EngineeringCost = field(default_factory=EngineeringCost)
     dt: float = 0.5
     horizon: float = 600.0
     wind_files: tuple[Path, ...] = ()
@@ -124,8 +122,8 @@ class Config(RunConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.task == "paper" and self.engineering() != EngineeringCost():
-            raise ValueError("rate weights are those of the task engineering; give --task engineering, too.")
+        if self.task == "paper" and self.engineering != EngineeringCost():
+            raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
         require_unknown(self.unknown)
         if self.unknown and (self.model_error or self.real == "rosco"):
@@ -159,12 +157,8 @@ class Config(RunConfig):
             except (ValueError, OSError) as error:
                 raise ValueError(f"wind_files: {error}") from error
         usual = "paper" if self.preset == "paper" and self.policy == "mlp" else OBSERVED[self.policy]
-        cost = self.engineering() if self.task == "engineering" else PaperCost()
+        cost = self.engineering if self.task == "engineering" else PaperCost()
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))
-
-    def engineering(self) -> EngineeringCost:
-        """The cost of the task engineering under the weights that are asked for."""
-        return EngineeringCost(pitch_rate=self.pitch_rate_weight, torque_rate=self.torque_rate_weight)
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
         if self.policy == "scheduled":

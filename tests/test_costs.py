@@ -20,7 +20,7 @@ RATED = 122.9096
 
 def turbine_cost(speed, torque, pitch, last, **weights):
     """The engineering cost at a generator speed [rad/s], an action and the action before it; all other weights zero."""
-    zero = dict.fromkeys(("energy", "excess", "overspeed", "overshoot", "pitch_rate", "torque_rate"), 0.0)
+    zero = dict.fromkeys(("energy", "excess", "overspeed", "overshoot", "underspeed", "pitch_rate", "torque_rate"), 0.0)
     plant = WindTurbine(cost=EngineeringCost(**zero | weights))
     state = double(speed / 97.0, speed, 11.0, 0.0, *last)
     return plant.running_cost(TIME_ZERO, state, double(torque, pitch), double(11.0)).item()
@@ -37,6 +37,10 @@ def test_the_engineering_cost_term_by_term():
     assert turbine_cost(RATED + 10.0, full, 5.0, still, overspeed=4.0) == pytest.approx(4.0 * 0.25, rel=1e-9)
     assert turbine_cost(RATED - 10.0, full, 5.0, still, overspeed=4.0, overshoot=4.0) == 0.0
     assert turbine_cost(1.1 * RATED + 2.0, full, 5.0, still, overshoot=5.0) == pytest.approx(5.0 * 0.01, rel=1e-9)
+    # A slow rotor costs where the wind is above rated, which it hardly is with 11 of 11.4 m/s.
+    windy = 1.0 / (1.0 + math.exp(0.8))
+    assert turbine_cost(RATED - 10.0, full, 5.0, still, underspeed=4.0) == pytest.approx(windy, rel=1e-9)
+    assert turbine_cost(RATED + 10.0, full, 5.0, still, underspeed=4.0) == 0.0
     # 1 deg and 15 kN m within 0.5 s.
     assert turbine_cost(RATED, full, 6.0, still, pitch_rate=1.0) == pytest.approx(4.0, rel=1e-12)
     assert turbine_cost(RATED, full - 15e3, 5.0, still, torque_rate=1.0) == pytest.approx(4.0, rel=1e-12)

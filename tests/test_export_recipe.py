@@ -90,7 +90,7 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
         ({"name": "../up"}, "name='../up' must be a name in C"),
         ({"recipe": Path("nowhere.py")}, "recipe=nowhere.py does not exist"),
         ({"recipe": RECIPES / "record_log.py"}, "has no class Config derived from RunConfig"),
-        ({"recipe": RECIPES / "flapping_wing.py"}, "cannot be carried out.*no option.*pitch_rate_weight"),
+        ({"recipe": RECIPES / "flapping_wing.py"}, "cannot be carried out.*no option.*engineering"),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
 )

@@ -47,7 +47,6 @@ def made(plant, **options):
 @pytest.mark.parametrize(
     ("plant", "options", "message"),
     [
-        ("wind_turbine", {"pitch_rate_weight": -0.1}, "pitch_rate_weight=-0.1 must be at least 0"),
         ("wind_turbine", {"wind_files": (Path("gone.bts"),)}, "wind_files: gone.bts is no file"),
         ("wind_turbine", {"real": "ROSCO"}, "real='ROSCO' does not exist; choose simulation or rosco"),
         ("flapping_wing", {"peak": "sharp"}, "peak='sharp' does not exist; choose unit or printed"),
@@ -61,13 +60,12 @@ def test_options_out_of_range_are_refused(plant, options, message):
         made(plant, **options)
 
 
-def test_a_weight_of_another_task_is_refused():
+def test_weights_of_another_task_are_refused():
     made = recipe("wind_turbine")
-    assert made.Config(task="engineering").plant().cost == made.EngineeringCost()
-    asked = made.Config(task="engineering", pitch_rate_weight=0.1, torque_rate_weight=1.0)
-    assert asked.plant().cost == made.EngineeringCost(pitch_rate=0.1, torque_rate=1.0)
-    with pytest.raises(ValueError, match="rate weights are those of the task engineering"):
-        made.Config(pitch_rate_weight=0.1)
+    weights = made.EngineeringCost(pitch_rate=0.1)
+    assert made.Config(task="engineering", engineering=weights).plant().cost == weights
+    with pytest.raises(ValueError, match="weights of the task engineering"):
+        made.Config(engineering=weights)
 
 
 def test_wind_that_no_turbine_has_met_is_refused(tmp_path):

@@ -446,17 +446,21 @@ class EngineeringCost:
         L_a = w_P\Big(1 - \frac{\min(P, P_r)}{P_r}\Big) + w_X\Big(\frac{(P - P_r)_+}{P_r}\Big)^2
         + w_\omega\Big(\frac{(\omega_g - \omega_{rated})_+}{\gamma_1}\Big)^2
         + w_O\Big(\frac{(\omega_g - \omega_{max})_+}{\gamma_1}\Big)^2
+        + w_U\,\sigma\Big(\frac{u - u_{rated}}{0.5\,\mathrm{m/s}}\Big)
+            \Big(\frac{(\omega_{rated} - \omega_g)_+}{\gamma_1}\Big)^2
         + w_\beta\Big(\frac{\dot\beta}{1\,\mathrm{deg/s}}\Big)^2
         + w_\tau\Big(\frac{\dot\tau_g}{15\,\mathrm{kN\,m/s}}\Big)^2
 
-    with the power P at the generator shaft, the drivetrain's rated power P_r = 5.297 MW, ω_max = 1.1 ω_rated, and the
-    rates of the actions that are applied. Power above rated earns nothing.
+    with the power P at the generator shaft, the drivetrain's rated power P_r = 5.297 MW, ω_max = 1.1 ω_rated, the wind
+    u, and the rates of the actions that are applied. Power above rated earns nothing. Without w_U a policy lets the
+    rotor give its energy where the wind falls short.
 
     Args:
         energy: weight w_P of the share of rated power that is not made.
         excess: weight w_X of power above rated.
         overspeed: weight w_ω of speed above rated.
         overshoot: weight w_O of speed above 110 % of rated, a soft constraint.
+        underspeed: weight w_U of speed below rated in wind above rated.
         pitch_rate: weight w_β of the blades' rate.
         torque_rate: weight w_τ of the torque's rate.
 
@@ -468,6 +472,7 @@ class EngineeringCost:
     excess: NotNegative = 1.0
     overspeed: NotNegative = 1.0
     overshoot: NotNegative = 10.0
+    underspeed: NotNegative = 0.0
     pitch_rate: NotNegative = 0.01
     torque_rate: NotNegative = 0.01
 
@@ -475,12 +480,14 @@ class EngineeringCost:
         share = plant.generator_power(state, applied) / (plant.actions[0].high * plant.rated_generator_speed)
         above = (plant.gear_ratio * state[..., 0] - plant.rated_generator_speed) / plant.speed_error_scale
         beyond = above - 0.1 * plant.rated_generator_speed / plant.speed_error_scale
+        windy = torch.sigmoid((exogenous[..., 0] - plant.rated_wind_speed) / 0.5)
         torque_rate, pitch_rate = ((applied - state[..., 4:6]) / plant.dt).unbind(-1)
         return (
             self.energy * (1.0 - share.clamp(max=1.0))
             + self.excess * (share - 1.0).clamp(min=0.0) ** 2
             + self.overspeed * above.clamp(min=0.0) ** 2
             + self.overshoot * beyond.clamp(min=0.0) ** 2
+            + self.underspeed * windy * above.clamp(max=0.0) ** 2
             + self.pitch_rate * pitch_rate**2
             + self.torque_rate * (torque_rate / TORQUE_RATE) ** 2
         )
