@@ -160,7 +160,7 @@ def row(name, results):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5, help="seeds of the training with default options")
+    parser.add_argument("--seeds", type=int, default=5, help="seeds of the training with default options; 0 for none")
     parser.add_argument("--also", action="append", default=[], help="further options of a training, in one string")
     parser.add_argument("--also-seeds", type=int, default=1, help="seeds of each training with further options")
     parser.add_argument("--tuning", action="append", default=[], help="parameters of ROSCO: 'PS_Mode=0 omega_pc=0.3'")
@@ -176,6 +176,8 @@ def main():
     for given, seeds in (("", options.seeds), *((each, options.also_seeds) for each in options.also)):
         folders = [options.folder / (given or "default") / str(seed) for seed in range(seeds)]
         results = [kept(folder, options.winds, learned, given, seed, folder) for seed, folder in enumerate(folders)]
+        if not results:
+            continue
         print(row(f"learned {given}".strip(), results), flush=True)
 
 
