@@ -348,15 +348,17 @@ class Belief:
     def require_sound_twin(self, episodes: Scenario) -> None:
         """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
 
-        A twin that says e⁵ times what the last real episode cost diverges, too: nothing that it says of a plan counts.
+        A twin that says e⁵ times what the last real episode cost diverges, too, and so does one that says e⁵ times what
+        any of the latest real episodes cost of virtual ones: nothing that it says of a plan counts.
 
         Raises:
             DivergenceError: if it does.
         """
         if not self.flown:
             return
-        twin, last = self.virtual.twin, self.policy_of(self.flown[-1])
-        if self.differences()[-1] <= -DEARER or not math.isfinite(self.virtual.cost(last, episodes)):
+        twin, last = self.virtual.twin, self.flown[-1]
+        again, elsewhere = self._predicted()[-1], self.virtual.cost(self.policy_of(last), episodes)
+        if diverges(last.cost, again) or diverges(max(one.cost for one in self.flown), elsewhere):
             raise DivergenceError(
                 f"plant {twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
                 f"system; the closure is {type(twin.closure).__name__}."
@@ -385,6 +387,11 @@ def difference(real: float, predicted: float) -> float:
     if not (real > 0.0 and predicted > 0.0):
         return 0.0
     return max(-DEARER, min(DEARER, math.log(real / predicted)))
+
+
+def diverges(real: float, predicted: float) -> bool:
+    """Whether a prediction is infinite, or e⁵ times the real cost and more."""
+    return math.isinf(predicted) or difference(real, predicted) <= -DEARER
 
 
 def alarm(differences: Sequence[float]) -> str | None:
