@@ -199,7 +199,7 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
         return flight
 
     found.flights.fly = flown
-    reports = [found.episode() for _ in range(13)]
+    reports = [found.episode() for _ in range(16)]
     refuted = [weights for weights in flights if weights]
     assert flights[0] is None and flights[1] and all(refuted.count(weights) == 1 for weights in refuted)
     assert reports[1]["alarm"].item() == 1.0 and not any(flights[-5:])

@@ -358,7 +358,8 @@ class Belief:
             return
         twin, last = self.virtual.twin, self.flown[-1]
         again, elsewhere = self._predicted()[-1], self.virtual.cost(self.policy_of(last), episodes)
-        if diverges(last.cost, again) or diverges(max(one.cost for one in self.flown), elsewhere):
+        pairs = [(last.cost, again), (max(one.cost for one in self.flown), elsewhere)]
+        if any(math.isinf(predicted) or difference(real, predicted) <= -DEARER for real, predicted in pairs):
             raise DivergenceError(
                 f"plant {twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
                 f"system; the closure is {type(twin.closure).__name__}."
@@ -387,11 +388,6 @@ def difference(real: float, predicted: float) -> float:
     if not (real > 0.0 and predicted > 0.0):
         return 0.0
     return max(-DEARER, min(DEARER, math.log(real / predicted)))
-
-
-def diverges(real: float, predicted: float) -> bool:
-    """Whether a prediction is infinite, or e⁵ times the real cost and more."""
-    return math.isinf(predicted) or difference(real, predicted) <= -DEARER
 
 
 def alarm(differences: Sequence[float]) -> str | None:

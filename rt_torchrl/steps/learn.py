@@ -803,23 +803,20 @@ class Learn(Step):
                 self.learner.store(transitions)
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        policy = self.learner.policy
+        policy, virtual = self.learner.policy, self.belief.virtual
         self.store(episode["transitions"].values())
         before, weights = copy.deepcopy(policy.state_dict()), parameters_to_vector(policy.parameters()).detach()
         report = self.learner.update()
-        if self.belief.corrects and self.belief.virtual.processes:
-            report = merged(report, self._judged(before))
+        if self.belief.corrects and virtual.processes:
+            judged_on, after = virtual.draw(self.count), copy.deepcopy(policy.state_dict())
+            found = self.belief.judge(policy, judged_on)
+            policy.load_state_dict(before)
+            earlier = self.belief.judge(policy, judged_on)
+            if found > earlier:
+                self.learner.restart()
+                reason = f"update refused: J_a of model_free would be {found.price:.4g}, it was {earlier.price:.4g}"
+                report = merged(report, findings(reason, update_accepted=0.0))
+            else:
+                policy.load_state_dict(after)
+                report = merged(report, findings(update_accepted=1.0))
         return merged(episode, report).set(("weight_changes", "model_free"), weight_change(policy, weights))
-
-    @torch.no_grad()
-    def _judged(self, before: dict[str, Any]) -> TensorDict:
-        policy, episodes = self.learner.policy, self.belief.virtual.draw(self.count)
-        after, found = copy.deepcopy(policy.state_dict()), self.belief.judge(policy, episodes)
-        policy.load_state_dict(before)
-        earlier = self.belief.judge(policy, episodes)
-        if found > earlier:
-            self.learner.restart()
-            reason = f"update refused: J_a of model_free would be {found.price:.4g}, it was {earlier.price:.4g}"
-            return findings(reason, update_accepted=0.0)
-        policy.load_state_dict(after)
-        return findings(update_accepted=1.0)

@@ -173,7 +173,8 @@ class PlantEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if (self._step_count == 0).any():
             self._closure = self.begin_episode()
-        t, exogenous = self._time(), self._now()
+        # An integer times a float would be single precision.
+        t, exogenous = self._step_count.double() * self.plant.dt, self._now()
         command = tensordict["action"]
         transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
@@ -204,7 +205,7 @@ class PlantEnv(EnvBase):
         exogenous = self._now()
         self._factor = self.sensor_factor()
         state = self._state * self._factor
-        observation = self.plant.observe(self._time(), state, exogenous)
+        observation = self.plant.observe(self._step_count.double() * self.plant.dt, state, exogenous)
         read = state[..., : len(self.plant.readings)]
         entries |= {"observation": observation, "state": read, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
@@ -217,10 +218,6 @@ class PlantEnv(EnvBase):
         drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
         read = [signal.name not in self.plant.memories for signal in self.plant.states]
         return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
-
-    def _time(self) -> Float[Tensor, " batch"]:
-        # An integer times a float would be single precision.
-        return self._step_count.double() * self.plant.dt
 
     def _now(self) -> Float[Tensor, "batch n_z"]:
         """The exogenous input of this interval; after the last interval, that of the last interval."""

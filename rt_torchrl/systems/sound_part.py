@@ -82,7 +82,13 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
         plant: plant that gives the length of an episode and the control interval.
         report: report of the safety layer about this episode, if there is one.
     """
-    refused, (overflow, overflows) = _refused(episode, report), _overflows(episode, plant.dt)
+    n = len(episode)
+    # At the end of a refused interval a safety layer has refused the reading; it may say so later in its report.
+    refused = torch.zeros(n, dtype=torch.bool, device="cpu")
+    if "refused" in episode["next"].keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
+        refused = episode["next", "refused"].flatten().cpu().clone()
+    refused[[k for k in (report.wrong if report is not None else ()) if k < n]] = True
+    overflow, overflows = _overflows(episode, plant.dt)
     wrong = refused | overflow
     wrong[1:] |= refused[:-1]  # what is read at the end of an interval is the start of the next one
     if "refused" in episode.keys():  # noqa: SIM118
@@ -92,7 +98,7 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
         at = refused.nonzero().flatten().tolist()
         reasons.append(f"the safety layer refused {len(at)} of its readings, the first at the end of interval {at[0]}")
     reasons += [fault.detail for fault in overflows][:1]
-    n, sound = len(episode), (~wrong).tolist()
+    sound = (~wrong).tolist()
     starts = [k for k, good in enumerate(sound) if good and (k == 0 or not sound[k - 1])]
     ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == n or not sound[k + 1])]
     over = plant.end_cost is not None and bool(episode["next", "terminated"][-1].any())
@@ -116,16 +122,6 @@ def report_of(env: EnvBase) -> SafetyReport | None:
     """The report of the safety layer of a real system about its last episode; None if there is none."""
     layer = layer_of(env)
     return layer.report if layer is not None and layer.reports else None
-
-
-def _refused(episode: TensorDictBase, report: SafetyReport | None) -> Bool[Tensor, " n"]:
-    """The intervals at whose end a safety layer has refused the reading, also where it did so later."""
-    n = len(episode)
-    refused = torch.zeros(n, dtype=torch.bool, device="cpu")
-    if "refused" in episode["next"].keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
-        refused = episode["next", "refused"].flatten().cpu().clone()
-    refused[[k for k in (report.wrong if report is not None else ()) if k < n]] = True
-    return refused
 
 
 def _overflows(episode: TensorDictBase, dt: float) -> tuple[Bool[Tensor, " n"], list[Fault]]:

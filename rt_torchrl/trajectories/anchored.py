@@ -108,7 +108,13 @@ class AnchoredReplays:
             counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], met[None])))
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
-        self._seen = [self._observed(record) for record in records]
+        self._seen = list[tuple[State, Tensor, Action]]()
+        """Some states of each episode, what policies observe there, and the actions that were flown there."""
+        for record in records:
+            last = len(record.actions) - 1
+            at = torch.linspace(0, last, min(last + 1, OBSERVATIONS), device=inputs.device).round().long()
+            states, t = twin.plant.at_rest(record.states[at]), record.start + at.double() * twin.plant.dt
+            self._seen.append((states, twin.plant.observe(t, states, record.exogenous[at]), record.actions[at]))
         with torch.no_grad():
             self.flown = torch.stack([self.actions(policy_of(k)) for k in range(len(records))])
         counts = [len(actions) for _, _, actions in self._seen]
@@ -126,13 +132,6 @@ class AnchoredReplays:
         found.read, found.inputs, found.anchored = (x[-count:] for x in (self.read, self.inputs, self.anchored))
         found.offsets, found.flown, found.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
         return found
-
-    def _observed(self, record: Trajectory) -> tuple[State, Tensor, Action]:
-        """Some states of an episode, what policies observe there, and the actions that were flown there."""
-        plant, n = self.twin.plant, len(record.actions)
-        at = torch.linspace(0, n - 1, min(n, OBSERVATIONS), device=record.states.device).round().long()
-        states, t = plant.at_rest(record.states[at]), record.start + at.double() * plant.dt
-        return states, plant.observe(t, states, record.exogenous[at]), record.actions[at]
 
     def corrections(self, policy: nn.Module) -> Costs:
         r"""The log :math:`c_i = \log\tilde J_i - \log\hat J_i` of what each anchored replay costs over the twin's own.

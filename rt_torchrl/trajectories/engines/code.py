@@ -60,20 +60,17 @@ class Inputs:
         self.sizes = [w.numel() for w in self.learned]
 
     @cached_property
-    def _arrays(self) -> list[np.ndarray]:
-        """The same memory in NumPy."""
-        return [w.detach().numpy() for w in self._all]
-
-    @cached_property
-    def _ends(self) -> list[int]:
-        return [*accumulate(w.numel() for w in self._all)]
+    def _places(self) -> list[tuple[np.ndarray, int]]:
+        """Their numbers in the memory of each, and where these end in a row."""
+        ends = accumulate(w.numel() for w in self._all)
+        return [(w.detach().numpy(), end) for w, end in zip(self._all, ends, strict=True)]
 
     def row(self, read: Iterable[int] | None = None) -> np.ndarray:
         """The present numbers of all of them as one row, or of those that are read."""
-        numbers = np.empty(max(1, *self._ends, 1))
+        numbers = np.empty(max([1, *(end for _, end in self._places)]))
         for k in range(len(self._all)) if read is None else read:
-            x = self._arrays[k]
-            numbers[self._ends[k] - x.size : self._ends[k]] = x.ravel()
+            x, end = self._places[k]
+            numbers[end - x.size : end] = x.ravel()
         return numbers
 
     def split(self, gradients: np.ndarray) -> list[Tensor]:
