@@ -7,11 +7,11 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
-from test_export_recipe import recipe
+from test_export_recipe import RECIPES, recipe
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -215,7 +215,7 @@ ARM = "--twinning.arm model_based"
     ],
 )
 def test_recipes_take_it_with_other_options(tmp_path, name, options):
-    module = recipe(name)
+    module = load_recipe(RECIPES / f"{name}.py")
     words = [*ALWAYS, *SHORT[name], "--log-dir", str(tmp_path / "run"), *options.split()]
     module.main(from_command_line(module.Config, words))
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())["episodes"]
