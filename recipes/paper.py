@@ -22,6 +22,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss
 
 from rt_torchrl import (
+    ActorCritic,
     DescentConfig,
     DigitalTwin,
     LearnerConfig,
@@ -34,7 +35,7 @@ from rt_torchrl import (
 from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
-from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, ActorCritic, Critic, LongTermMemory, ScaledPolicy
+from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, LongTermMemory, ScaledPolicy
 from rt_torchrl.steps.report import weight_change
 from rt_torchrl.steps.switch import STALL
 from rt_torchrl.systems.collectors import collector_of

@@ -384,6 +384,6 @@ def test_kinds_of_episodes_are_counted_and_averaged_apart():
     assert np.isclose(strong["J_a"]["mean"], found["model_free"].control_costs[:3].mean().item())
     median = found["model_free"].merit["final distance [m]"][:3].median().item()
     assert strong["merit"]["final distance [m]"]["median"] == median
-    lines = merit_lines({"episodes": COUNT, **results(unseen, found)})
+    lines = merit_lines({"episodes": COUNT, "judged_on": unseen.judged_on, **results(unseen, found)})
     assert any("gust too strong to hold, 3 of 12 episodes" in line for line in lines)
     assert sum("final distance" in line for line in lines) == 3
