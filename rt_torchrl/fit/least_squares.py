@@ -148,7 +148,7 @@ def over_segments(
     fits: dict[int, tuple[R, Tensor, dict[str, Tensor]]] = {}
     diverged: list[FloatingPointError] = []
 
-    def explains(length: int) -> bool:
+    def explains(length: int, start: dict[str, Tensor]) -> bool:
         closure.load_state_dict(start)
         try:
             result, errors = fit(length)
@@ -159,22 +159,21 @@ def over_segments(
         return bool((errors <= enough).all())
 
     short = max(intervals // SHORT, 2)
-    whole = explains(0)
+    whole = explains(0, start)
     if not whole and short < intervals:
-        first, present = fits.pop(0, None), start
-        explains(short)
+        first = fits.pop(0, None)
+        explains(short, start)
         probed = fits.pop(short, None)
         if probed is not None:
-            start = probed[2]
-            whole = explains(0) or (0 in fits and not unstable())
-        if first is not None:
-            start = present if first[1].isfinite().all() else start
-            if 0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough):
-                fits[0] = first
+            whole = explains(0, probed[2]) or (0 in fits and not unstable())
+            if first is None or not first[1].isfinite().all():
+                start = probed[2]
+        if first is not None and (0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough)):
+            fits[0] = first
     length = 0
     while not whole and length != 1:
         length = max((length or intervals) // SHORTENED, 1)
-        whole = explains(length)
+        whole = explains(length, start)
     if not fits:
         raise diverged[0]
     least = torch.stack([errors for _, errors, _ in fits.values()]).amin(0)
