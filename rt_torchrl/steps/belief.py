@@ -361,8 +361,8 @@ class Belief:
         pairs = [(last.cost, again), (max(one.cost for one in self.flown), elsewhere)]
         if any(math.isinf(predicted) or difference(real, predicted) <= -DEARER for real, predicted in pairs):
             raise DivergenceError(
-                f"plant {twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
-                f"system; the closure is {type(twin.closure).__name__}."
+                f"plant {twin.plant.name!r} diverged on its twin, or cost there e⁵ times what real episodes did, with "
+                f"the weights that have just flown on the real system; the closure is {type(twin.closure).__name__}."
             )
 
     def state_dict(self) -> dict[str, Any]:
