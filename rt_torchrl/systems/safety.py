@@ -326,13 +326,13 @@ class SafetyLayer(AroundSystem):
         if getattr(innermost(self.env), "reads_applied", False):
             self._last = reading["applied"].clone()  # of a machine in operation
         self._flags = self._flag(False), self._flag(False)
-        return self._begun(reading, None)
+        return self._begun(reading)
 
-    def _begun(self, reading: TensorDictBase, applied: Tensor | None) -> TensorDictBase:
+    def _begun(self, reading: TensorDictBase) -> TensorDictBase:
         """What an episode or a window begins with; the machine need not say what it has applied."""
         reading = self._remember(reading)
         if "applied" not in reading:
-            reading["applied"] = self.action_spec.zero() if applied is None else applied.clone()
+            reading["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
         reading["tripped"], reading["refused"] = (flag.clone() for flag in self._flags)
         return reading
 
@@ -341,7 +341,7 @@ class SafetyLayer(AroundSystem):
 
     def _gone_on(self, reading: TensorDictBase) -> TensorDictBase:
         """The present reading once more; what the layer has found in it, its limits and its watchdog go on."""
-        return self._begun(reading.copy(), self._last)
+        return self._begun(reading.copy())
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
