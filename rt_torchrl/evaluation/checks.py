@@ -105,12 +105,3 @@ def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elem
     finally:
         hook.remove()
     return seen[-1]
-
-
-@torch.no_grad()
-def rms_error(
-    closure: nn.Module, true: nn.Module, features: Float[Tensor, "*points n_f"]
-) -> Float[Tensor, " n_coefficients"]:
-    """Root mean square error of every coefficient of a closure over the points."""
-    error = closure(features) - true(features)
-    return error.flatten(0, -2).square().mean(0).sqrt()
