@@ -435,9 +435,7 @@ def comparisons_of(
 
 def of_the_class(role: Role, config: RunConfig) -> bool:
     """Whether the policy of a role is of the class that ``config.policy`` names."""
-    if role == "model_based":
-        return config.twinning.planner.method != "receding_horizon"
-    return config.model_free_policy in ("same", config.policy)
+    return role == "model_free" or config.twinning.planner.method != "receding_horizon"
 
 
 def main(config: Config) -> None:

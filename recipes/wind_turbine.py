@@ -129,13 +129,6 @@ class Config(RunConfig):
         if self.unknown and (self.model_error or self.real == "rosco"):
             other = "model_error" if self.model_error else "real='rosco'"
             raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")
-        other = self.model_free_policy
-        if not self.observe and "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
-            raise ValueError(
-                f"model_free_policy={other!r} does not go with policy={self.policy!r}: of the two, only the scheduled "
-                "one observes speed and pitch. Choose same, or policy scheduled and model_free_policy mlp; or say by "
-                "observe what both see."
-            )
 
     def presets(self) -> dict[Preset, dict[str, Any]]:
         paper = {"policy": "paper", "start": "random", "twinning": PAPER_T1}

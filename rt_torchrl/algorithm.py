@@ -129,7 +129,6 @@ class ReinforcementTwinning(TensorDictSequential):
             twin,
             config.exogenous,
             config.experience,
-            constraints=getattr(planner, "constraints", None),
             extremes=0 if fed_back or config.planner.method == "single_start" else EXTREMES,
             generator=generator,
         )

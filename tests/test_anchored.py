@@ -18,8 +18,7 @@ from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.plant import Transition
 from rt_torchrl.plants.sensors import UnreadInput
 from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
-from rt_torchrl.steps.config import ConstraintsConfig, ExogenousConfig
-from rt_torchrl.steps.constraints import Constraints
+from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
@@ -344,18 +343,6 @@ def test_the_best_that_flew_is_found_whatever_was_computed_before():
     assert judged == again and torch.equal(weights["gain"], same["gain"])
     policy = LinearGain(weights["gain"].tolist())
     assert warm.judge(policy, episodes).expected == pytest.approx(judged.expected, rel=1e-12)
-
-
-def test_prices_are_corrected_in_plans_as_where_policies_are_compared():
-    real, physics = pushed(horizon=2.0)
-    belief, policy = belief_of(real, physics, [(0.5, 0.5)]), LinearGain([[0.6, 0.5]])
-    constraints = Constraints(physics, ConstraintsConfig(states={"position": (-0.1, 0.1)}))
-    constraints.multipliers = [3.0]
-    belief.virtual.constraints = constraints
-    episodes = virtual_episodes(physics)
-    planned = constraints.costs(belief.virtual.twin, policy, episodes).mean().item()
-    assert planned == pytest.approx(belief.judge(policy, episodes).expected, rel=1e-9)
-    assert planned > 1.1 * belief.expected(policy, belief.virtual.cost(policy, episodes))
 
 
 def test_a_belief_that_corrects_nothing_withdraws_what_another_one_said():

@@ -1,4 +1,4 @@
-"""Step 4: first states as unknowns, records replayed in segments, and fits to some sensors."""
+"""Step 4: first states as unknowns, and records replayed in segments."""
 
 from pathlib import Path
 
@@ -9,18 +9,14 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation
-from rt_torchrl.fit.sensors import sensor_record, sensors_of, state_sensors
+from rt_torchrl.fit.sensors import sensor_record, state_sensors
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.steps.assimilate import Assimilation, FirstStates, SensorAssimilation
-from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
-from rt_torchrl.steps.hypotheses.ensemble import make_twin
+from rt_torchrl.steps.assimilate import Assimilation
+from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -193,154 +189,6 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
 def test_a_bad_segment_is_refused(segment, message):
     with pytest.raises(ValueError, match=message):
         of_segments(LinearQuadratic(), LinearClosure(torch.zeros(2, 2)), segment=segment)
-
-
-NONE = HypothesesConfig()
-
-
-def config(*sensors, **options):
-    given = {"method": "levenberg_marquardt", "inputs": "record", "initial": "estimated", "iterations": 30}
-    return AssimilationConfig(sensors=sensors, **given | options)
-
-
-def episodes(plant, count, seed=0):
-    """Real episodes under random commands, each held for some intervals."""
-    generator, found = torch.Generator().manual_seed(seed), []
-    for _ in range(count):
-        start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-        n, low = plant.n_steps, torch.tensor([a.low for a in plant.actions]).double()
-        high = torch.tensor([a.high for a in plant.actions]).double()
-        held = torch.rand(1, n // 20 + 1, len(low), generator=generator, dtype=torch.float64)
-        share = 0.3 + 0.4 * held.repeat_interleave(20, 1)[:, :n]
-        with torch.no_grad():
-            found.append(Rollout(plant, plant.closure)(start, inputs, low + share * (high - low)).each()[0])
-    return found
-
-
-def blinded(plant, record, names):
-    """The record with NaN in every state that no sensor reads."""
-    hidden = [k for k, state in enumerate(plant.states) if state.name not in names]
-    states = record.states.clone()
-    states[:, hidden] = torch.nan
-    return record._replace(states=states)
-
-
-@pytest.mark.slow
-def test_the_tank_is_identified_from_its_pressure_alone():
-    plant = CryogenicTank(horizon=21600.0)
-    records = [blinded(plant, record, ["pressure"]) for record in episodes(plant, 2)]
-    closure = plant.make_closure(torch.Generator())
-    step = make_assimilation(DigitalTwin(plant, closure), config("pressure"), NONE)
-    found = step.update(records, [], 1, torch.Generator())
-    # From [1, 1, 10]: without noise only the wall's start, which follows p to 1e-5 K or so, is uncertain.
-    true = plant.closure.coefficients
-    assert ((closure.coefficients / true - 1.0).abs() < 1e-4).all()
-    assert found.best < 1e-3 * found.start
-    report = step.report()
-    assert report["noise/pressure"] < 100.0 and set(report) > {"standard_error/U_s", "standard_error/K_JT"}
-
-
-def test_first_states_follow_from_what_is_read():
-    """The tank's wall is as cold as the fluid, whose temperature follows from the pressure; its fill is always 70 %."""
-    plant = CryogenicTank(horizon=3600.0)
-    (record,) = episodes(plant, 1, seed=3)
-    sensors = sensors_of(plant, ["pressure"])
-    first = FirstStates(plant, sensors)
-    guess = first.guess(sensor_record(plant, sensors, blinded(plant, record, ["pressure"])))
-    # The saturation curve is straight to some mK over ±50 kPa.
-    assert guess[0].item() == pytest.approx(record.states[0, 0].item(), abs=0.02)
-    assert guess[1:].tolist() == pytest.approx(record.states[0, 1:].tolist())
-    assert first.spread[1] == 0.0 and 0.0 < first.spread[0] < 0.02 and first.spread[2] == torch.inf
-
-
-def test_nothing_is_fitted_in_no_iteration_and_a_start_from_nonsense_begins_anew():
-    plant = LinearQuadratic()
-    records = episodes(plant, 1)
-    closure = plant.make_closure(torch.Generator().manual_seed(0))
-    before = closure.matrix.detach().clone()
-    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity", iterations=0))
-    step.update(records, [], 1, torch.Generator())
-    assert torch.equal(closure.matrix, before) and step.report() == {}
-    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity"))
-    with torch.no_grad():
-        closure.matrix.fill_(1e9)
-    found = step.update(records, [], 1, torch.Generator())
-    assert found.start == float("inf")
-    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
-
-
-def test_what_does_not_go_with_sensors_is_refused():
-    for options in ({"initial": "measured"}, {"segment": 5}):
-        with pytest.raises(ValueError, match=r"sensors=\('position',\) .* need initial='estimated' and no segment"):
-            config("position", **options)
-    plant = WindTurbine(horizon=60.0)
-    closure = plant.make_closure(torch.Generator())
-    twin = make_twin(plant, closure, HypothesesConfig())
-    with pytest.raises(ValueError, match="do not go with hypotheses"):
-        make_assimilation(twin, config("rotor_speed"), NONE)
-    with pytest.raises(ValueError, match="roof cannot be measured"):
-        make_assimilation(DigitalTwin(plant, closure), config("roof"), NONE)
-
-
-def test_a_recipe_that_fits_sensors_leaves_the_hypotheses_out():
-    recipe = load_recipe(Path(__file__).parent.parent / "recipes" / "cryogenic_tank.py").Config
-    asked = ["--twinning.assimilation.sensors", "pressure", "--twinning.assimilation.initial", "estimated"]
-    asked += ["--twinning.assimilation.method", "levenberg_marquardt", "--twinning.assimilation.inputs", "record"]
-    assert from_command_line(recipe, asked).twinning.hypotheses.which == ("none",)
-    assert from_command_line(recipe, []).twinning.hypotheses.which == ("automatic",)
-
-
-TIMES = 0.1 * np.arange(61)
-
-
-def test_a_biased_sensor_is_found_in_step_4():
-    plant = LinearQuadratic()
-    records = episodes(plant, 1)
-    states = records[0].states.clone()
-    states[:, 0] += 0.4
-    closure = plant.make_closure(torch.Generator().manual_seed(0))
-    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity", biased=("position",)))
-    step.begun = True  # one start is enough
-    step.update([records[0]._replace(states=states)], [], 1, torch.Generator())
-    assert step.report()["bias/position"] == pytest.approx(0.4, abs=1e-6)
-    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
-    with pytest.raises(ValueError, match=r"biased=\('roof',\): roof is none of the sensors"):
-        SensorAssimilation(DigitalTwin(plant, closure), config("position", biased=("roof",)))
-
-
-# Step 4 from first weights that a single descent does not lead away from.
-
-
-class Folded(torch.nn.Module):
-    """A spring p = (0, k x) of stiffness k = 0.1 (w³ − 3w), of at least −0.2 for positive w."""
-
-    def __init__(self, w):
-        super().__init__()
-        self.w = torch.nn.Parameter(torch.tensor([w], dtype=torch.float64))
-
-    def forward(self, features):
-        w = self.w[0]
-        spring = 0.1 * (w**3 - 3.0 * w) * features[..., 0]
-        return torch.stack([torch.zeros_like(spring), spring], -1)
-
-
-class Stiff(LinearQuadratic):
-    true_closure = ((0.0, 0.0), (-0.5, 0.0))
-
-
-def test_a_local_minimum_is_left_by_other_first_weights():
-    """From w = 1.5 the stiffness −0.5 is behind a hill; w³ − 3w = −5 has one root, w = −2.27902."""
-    plant = Stiff(noise=0.0)
-    record, twin = flight(plant), DigitalTwin(plant, Folded(1.5))
-    found = {}
-    for starts in (1, 4):
-        twin.closure.load_state_dict(Folded(1.5).state_dict())
-        config = AssimilationConfig(inputs="record", iterations=30, method="levenberg_marquardt", starts=starts)
-        fit = Assimilation(twin, config).update([record], [], 1, torch.Generator())
-        found[starts] = fit, twin.closure.w.item()
-    assert found[1][1] == pytest.approx(1.0, abs=0.1) and found[1][0].best > 1e-3
-    assert found[4][1] == pytest.approx(-2.27902, abs=1e-4) and found[4][0].best < 1e-10
-    assert found[4][0].start == found[1][0].start
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ class ByGain(VirtualEpisodes):
 
     def __init__(self):
         plant = LinearQuadratic(horizon=2.0)
-        self.twin, self.constraints, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), None, ()
+        self.twin, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), ()
         self.flights, self.processes = 0, [None]
 
     def draw(self, count):

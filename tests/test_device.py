@@ -238,7 +238,7 @@ ONE_OF_EACH = dataclasses.replace(
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
 )
-NEURAL = {"closure": "mlp", "model_free_policy": "mlp", "hidden": (4,)}
+NEURAL = {"closure": "mlp", "policy": "mlp", "hidden": (4,)}
 TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import io
-import itertools
 import json
 import runpy
 import sys
@@ -37,20 +36,18 @@ WITHOUT_NEURAL_CLOSURE = ("pendulum",)
 
 
 def combinations():
-    """Plant, closure, policy and model-free policy: every pair of policies, and every closure."""
+    """Plant, closure and policy: every policy, and every closure."""
     for plant in PLANTS:
         kind = config_class_of(RECIPES / f"{plant}.py")
         (closure, *closures), policies = choices(kind, "closure"), choices(kind, "policy")
-        for policy, other in itertools.product(policies, ("same", *policies)):
-            if "scheduled" not in (policy, other) or other in ("same", policy, "mlp"):
-                yield plant, closure, policy, other
+        yield from ((plant, closure, policy) for policy in policies)
         for further in closures if plant not in WITHOUT_NEURAL_CLOSURE else ():
-            yield plant, further, policies[0], "same"
+            yield plant, further, policies[0]
 
 
-@pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
-def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, other, tmp_path):
-    options = {"policy": policy, "closure": closure, "model_free_policy": other, "hidden": (3,)}
+@pytest.mark.parametrize(("plant", "closure", "policy"), list(combinations()))
+def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, tmp_path):
+    options = {"policy": policy, "closure": closure, "hidden": (3,)}
     options |= {"horizon": 3000.0} | ({} if plant == "pendulum" else {"model_error": True})
     config, parts = leave_run(tmp_path, plant, **options)
     run = load_run(tmp_path)
@@ -59,7 +56,7 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
         found = run.closure if role == "closure" else run.policy(role)
         assert type(found) is type(part)
         require_same_weights(found, part)
-    assert isinstance(run.policy("model_free"), SaturatedMLP) >= (other == "mlp")
+    assert isinstance(run.policy("model_free"), SaturatedMLP) >= (policy == "mlp")
 
 
 def require_same_weights(found, expected):
@@ -93,9 +90,9 @@ def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plan
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_a_run_with_two_kinds_of_policies_and_a_neural_closure_is_exported(plant, tmp_path):
+def test_a_run_with_a_neural_closure_is_exported(plant, tmp_path):
     closure = {} if plant in WITHOUT_NEURAL_CLOSURE else {"closure": "mlp"}
-    _, parts = leave_run(tmp_path, plant, model_free_policy="mlp", hidden=(3,), **closure)
+    _, parts = leave_run(tmp_path, plant, policy="mlp", hidden=(3,), **closure)
     export = recipe("export")
     for role in ("model_based", "model_free"):
         export.main(export.Config(run=tmp_path, role=role, formats=("pt2",)))
@@ -104,13 +101,6 @@ def test_a_run_with_two_kinds_of_policies_and_a_neural_closure_is_exported(plant
         seen = torch.rand(4, observations, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         # The same operations on the same numbers; a compiler may put sums in another order.
         torch.testing.assert_close(written(seen), parts[role](seen), rtol=1e-12, atol=1e-12)
-
-
-def test_policies_of_two_turbines_are_refused():
-    config = config_class_of(RECIPES / "wind_turbine.py")
-    for policy, other in (("paper", "scheduled"), ("scheduled", "bias"), ("mlp", "scheduled")):
-        with pytest.raises(ValueError, match=f"model_free_policy='{other}' does not go with policy='{policy}'"):
-            config(policy=policy, model_free_policy=other)
 
 
 ROOM = """

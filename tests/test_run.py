@@ -90,20 +90,6 @@ def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
     assert metrics["episodes"][3]["J_a_unseen"] == pytest.approx(mean, rel=1e-14)
 
 
-def test_the_model_free_policy_may_be_of_another_kind(tmp_path):
-    run = small_run(tmp_path, episodes=1, model_free_policy="mlp", hidden=(4,))
-    assert {role: type(policy).__name__ for role, policy in run.algorithm.policies.items()} == {
-        "model_based": "LinearGain",
-        "model_free": "SaturatedMLP",
-    }
-    unseen = run.train()["summary"]["unseen"]
-    for key, role in (("J_a_before", "model_based"), ("J_a_before_model_free", "model_free")):
-        cost = run.unseen.control_costs(run.initial_policies[role]).mean().item()
-        assert unseen[key]["mean"] == pytest.approx(cost, rel=1e-14)
-    with pytest.raises(ValueError, match="model_free_policy='cubic' does not exist"):
-        small_run(tmp_path / "other", model_free_policy="cubic")
-
-
 class Worn(RunConfig):
     """The real system loses its own stiffness from the second episode on."""
 
@@ -149,11 +135,10 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     assert found["unseen"]["J_p"]["mean"] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("options", [{}, {"model_free_policy": "mlp", "hidden": (4,)}], ids=["same", "two kinds"])
-def test_resuming_gives_the_same_run_to_the_bit(tmp_path, options):
-    whole = small_run(tmp_path / "whole", episodes=4, **options).train()
-    small_run(tmp_path / "parts", episodes=2, **options).train()
-    parts = small_run(tmp_path / "parts", episodes=4, resume=True, **options).train()
+def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
+    whole = small_run(tmp_path / "whole", episodes=4).train()
+    small_run(tmp_path / "parts", episodes=2).train()
+    parts = small_run(tmp_path / "parts", episodes=4, resume=True).train()
     assert_same(whole, parts)
 
 
@@ -260,7 +245,6 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
         ({"hidden": (8, 0)}, r"hidden\[1\]=0 must be at least 1"),
         ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
         ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
-        ({"model_free_policy": "x"}, "model_free_policy='x' does not exist; choose same, plant or mlp"),
         (
             {"engine": "fast"},
             "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd",

@@ -401,12 +401,11 @@ def test_what_an_optimum_depends_on_has_a_file_of_its_own(tmp_path):
 
 
 def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
-    """Model predictive control, and a policy of another class, may cost less than the optimum of the class."""
+    """Model predictive control may cost less than the optimum of the class."""
     twinning = {name: ("--twinning.planner.method", name) for name in ("single_start", "receding_horizon")}
     arms = {
         "plan": (twinning["single_start"], 0.9, "model_based"),
         "mpc": (twinning["receding_horizon"], 0.5, "model_based"),
-        "other": (("--model-free-policy", "mlp"), 0.4, "model_free"),
     }
     trainings, searches = {}, {}
     for arm, (words, cost, live) in arms.items():
@@ -420,7 +419,7 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         ]
         searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
     (found,) = study.comparisons_of(trainings, searches)
-    assert [row.optimum for row in found.rows] == [0.9] * 3
+    assert [row.optimum for row in found.rows] == [0.9] * 2
 
 
 def test_a_folder_with_a_run_of_another_recipe_is_refused(tmp_path):

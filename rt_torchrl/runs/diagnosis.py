@@ -125,7 +125,7 @@ def _inputs(run: LoadedRun, costs: Costs) -> Reason:
     if not planned:
         return Reason(name, None, "no plan was made", remedy)
     corrected = abs(entries[-1].get("paired_difference") or 0.0) > NOISE
-    if corrected or run.live != "model_based" or run.config.twinning.planner.constraints.states:
+    if corrected or run.live != "model_based":
         return Reason(name, None, "what the last plan expected is not the cost of the live policy on the twin", remedy)
     evidence = f"unseen episodes cost {costs.mean():.4g} on the twin, the last plan expected {planned[-1]:.4g}"
     return Reason(name, _dearer(costs, costs.new_full((1,), planned[-1]), INPUTS), evidence, remedy)

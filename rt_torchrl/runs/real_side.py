@@ -104,8 +104,7 @@ def judged_on(
         unseen.judged_on = "simulation" if env is None else "simulation of the real system"
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
-    bounds = {**config.twinning.limits.states, **config.twinning.planner.constraints.states}
-    unseen.physics, unseen.bounds = twin.plant, StateBounds(plant.readings, bounds)
+    unseen.physics, unseen.bounds = twin.plant, StateBounds(plant.readings, config.twinning.limits.states)
     return unseen
 
 

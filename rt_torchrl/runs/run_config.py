@@ -27,7 +27,7 @@ from rt_torchrl.options import (
 )
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
-from rt_torchrl.steps.config import PAPER, HypothesesConfig, Role, TwinningConfig
+from rt_torchrl.steps.config import PAPER, Role, TwinningConfig
 from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 
@@ -65,8 +65,6 @@ class RunConfig:
         policy: kind of both policies: plant for the plant's own policy, or mlp. A recipe may call its plant's own
             policy paper, and offer other policies.
         hidden: widths of the hidden layers of an mlp policy.
-        model_free_policy: kind of the model-free policy, one of the choices of policy; same for the kind and the
-            initial weights of the model-based policy.
         closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
             call its plant's own law paper. An mlp has the defaults of the preset neural.
         episodes: number n_e of real episodes.
@@ -117,7 +115,6 @@ class RunConfig:
     preset: Preset = "default"
     policy: Literal["plant", "mlp"] = "plant"
     hidden: Widths = (32, 32)
-    model_free_policy: str = "same"
     closure: Literal["plant", "mlp"] = "plant"
     episodes: AtLeastOne = 20
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = 0
@@ -145,11 +142,6 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         require_checked(type(self))
-        known = choices(type(self), "policy")
-        if known and self.model_free_policy not in ("same", *known):
-            raise ValueError(
-                f"model_free_policy={self.model_free_policy!r} does not exist; choose same, {' or '.join(known)}."
-            )
         for logger in self.loggers:
             if logger in PACKAGES and importlib.util.find_spec(logger) is None:
                 raise ValueError(f"loggers={logger!r} needs a package that is not installed: pip install {logger}.")
@@ -193,13 +185,9 @@ class RunConfig:
         return plant.make_closure(generator)
 
     def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
-        """The policies π_mb and π_mf; with ``model_free_policy`` same they have the same initial weights."""
+        """The policies π_mb and π_mf, with the same initial weights."""
         model_based = self.make_policy(plant, generator)
-        if self.model_free_policy == "same":
-            return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
-        choice: dict[str, Any] = {"policy": self.model_free_policy}  # of the recipe's own Literal
-        other = dataclasses.replace(self, **choice)
-        return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
+        return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
 
     def acting_policies(
         self, policies: dict[Role, nn.Module], physics: Plant, closure: nn.Module
@@ -238,10 +226,7 @@ class RunConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
         A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
-        Hypotheses replay the whole state, and are left out where the twin is fitted to some sensors alone.
         """
-        if self.twinning.assimilation.sensors:
-            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which=("none",)))
         if self.start == "random":
             return twinning
         exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)

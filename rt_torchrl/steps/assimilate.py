@@ -1,4 +1,4 @@
-"""Step 4: the closure is trained until the twin replays the record, or what some sensors have read of it."""
+"""Step 4: the closure is trained until the twin replays the record."""
 
 import contextlib
 import copy
@@ -14,28 +14,16 @@ from torch import Tensor
 from rt_torchrl.fit.least_squares import (
     EXPLAINED,
     NOISE_TOLERANCE,
-    Estimate,
     Estimation,
-    EstimationConfig,
     judged,
-    multi_start,
     over_segments,
     scatter_of,
 )
 from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
-from rt_torchrl.fit.sensors import (
-    Sensor,
-    SensorRecord,
-    sensor_records,
-    sensors_of,
-    state_places,
-    state_sensors,
-    with_biases,
-)
+from rt_torchrl.fit.sensors import SensorRecord, sensor_records, state_places, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
-from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig
@@ -46,12 +34,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 DAMPING = 1e-3
 """Damping μ of the first fit by Levenberg-Marquardt."""
-STARTS = 10
-"""Number of first weights in the first episode of a fit to sensors: one sensor may leave several local minima."""
-ROUNDS = 4
-"""Greatest number of rounds in which the noise levels follow the residuals, in an episode."""
-DRAWS = 200
-"""Number of initial states that a plant draws, to learn how hidden ones depend on those that are read."""
 
 
 class Assimilation:
@@ -124,7 +106,7 @@ class Assimilation:
             sampled = torch.cat([process.sample(count, generator) for process in processes])
             rows = torch.arange(len(whole.states), device=sampled.device).repeat_interleave(count)
             whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
-        if self.config.sensors or not self.config.iterations:
+        if not self.config.iterations:
             return self._descend_anew(whole)
         if self.config.segment is None:
             return self._over_chosen_segments(whole)
@@ -199,21 +181,13 @@ class Assimilation:
         return found._replace(start=found.start - before, best=found.best - prior().item())
 
     def _least_squares(self, replayed: Trajectory) -> Descended:
-        """Descend by Levenberg-Marquardt from each of the first weights; the best weights stay."""
-        config, tolerance = self.config, 1e-4 if self.config.initial == "measured" else NOISE_TOLERANCE
-
-        def descend(number: int) -> Descended:
-            likelihood = self.likelihood(replayed, prior=self.prior)
-            method = LevenbergMarquardt(
-                likelihood.unknowns, damping=DAMPING if number else self.damping, tolerance=tolerance
-            )
-            found = method.run(likelihood.normal_equations, config.iterations, stop_below=config.stop_below)
-            if not number:
-                self.damping = method.damping
-            return found
-
-        found = multi_start(self.twin.closure, config.starts, descend, first=self.first)
-        return found[0]._replace(best=min((one.best for one in found), default=math.nan))
+        """Descend by Levenberg-Marquardt; the damping goes on from episode to episode."""
+        likelihood = self.likelihood(replayed, prior=self.prior)
+        tolerance = 1e-4 if self.config.initial == "measured" else NOISE_TOLERANCE
+        method = LevenbergMarquardt(likelihood.unknowns, damping=self.damping, tolerance=tolerance)
+        found = method.run(likelihood.normal_equations, self.config.iterations, stop_below=self.config.stop_below)
+        self.damping = method.damping
+        return found
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         return identification_cost(self.twin.plant, self._flown(replayed), replayed.states, replayed.seen).mean()
@@ -321,117 +295,6 @@ class Assimilation:
         closure.load_state_dict(state["first"])
         self.begin()
         closure.load_state_dict(present)
-
-
-class SensorAssimilation(Assimilation):
-    """Estimates weights, first states and noise levels from some sensors; of records it uses nothing else.
-
-    Args:
-        twin: twin whose closure is updated in place.
-        config: parameters of step 4, with ``sensors``.
-
-    Raises:
-        ValueError: if the plant has no such state or measurement.
-    """
-
-    def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
-        super().__init__(twin, config)
-        self.sensors = with_biases(sensors_of(twin.plant, config.sensors), config.biased)
-        self.estimate: Estimate | None = None
-        self.begun = False
-
-    def _descend(self, replayed: Trajectory) -> Descended:
-        config, first = self.config, FirstStates(self.twin.plant, self.sensors)
-        if not config.iterations:
-            return Descended(math.nan, math.nan, math.nan, 0)
-        records = sensor_records(self.twin.plant, self.sensors, replayed)
-        records = [record._replace(guess=first.guess(record), course=None) for record in records]
-        starts = 1 if self.begun else STARTS
-        options = EstimationConfig(iterations=config.iterations, rounds=ROUNDS, prior=config.prior, starts=starts)
-        estimation = Estimation(self.twin, self.sensors, spread=first.spread, config=options)
-        start = [w.detach().clone() for w in self.twin.closure.parameters()]
-        self.estimate, self.begun = estimation.run(records), True
-        found = [w.detach().clone() for w in self.twin.closure.parameters()]
-        noise, samples = self.estimate.likelihood.noise, sum(int(record.seen.sum()) for record in records)
-        costs = [self._misfit(estimation, records, noise, weights) for weights in (start, found)]
-        before, after = (found.cost.item() / samples for found in costs)
-        return Descended(before, after, costs[0].gradient.norm().item(), self.estimate.iterations)
-
-    @torch.no_grad()
-    def _misfit(
-        self, estimation: Estimation, records: list[SensorRecord], noise: Float[Tensor, " n_y"], weights: list[Tensor]
-    ) -> NormalEquations:
-        """The likelihood's equations for these weights, at the first states that suit them best."""
-        for held, value in zip(self.twin.closure.parameters(), weights, strict=True):
-            held.copy_(value)
-        return estimation.fit_initial_states(records, noise).normal_equations()
-
-    def report(self) -> Mapping[str, float | str]:
-        """RMS and standard errors, noise levels and biases of the last update, by name."""
-        if self.estimate is None:
-            return {}
-        errors = self.standard_errors(self._records)
-        found = {f"noise/{name}": value for name, value in self.estimate.noise.items()}
-        found |= {f"bias/{name}": self.estimate.biases[name] for name in self.config.biased}
-        return {**found, **{f"standard_error/{name}": value for name, value in errors.items()}, **super().report()}
-
-    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
-        """RMS error of what every sensor reads, in the records of the last update."""
-        if self.estimate is None:
-            return {}
-        signals = [sensor.measurement for sensor in self.sensors]
-        errors = judged(self.estimate.likelihood).rms.tolist()
-        return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
-
-    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
-        """Standard errors of the last update."""
-        return {} if self.estimate is None else self.estimate.uncertainty.standard_errors()
-
-    def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"begun": self.begun}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state)
-        self.begun = state["begun"]
-
-
-class FirstStates:
-    r"""What the first state of an episode is, given the states that sensors read in its first sample.
-
-    .. math:: \hat s = \bar s + C_{sy}C_{yy}^{-1}(y - \bar y)
-
-    Mean and covariance are those of the initial states that the plant draws. A state that always begins with the same
-    value, or follows from one that is read, is known.
-
-    Args:
-        plant: the plant.
-        sensors: the sensors.
-
-    Attributes:
-        spread: standard deviation of the first state about that guess; infinite for states that are read.
-    """
-
-    def __init__(self, plant: Plant, sensors: tuple[Sensor, ...]):
-        drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0))
-        own = state_places(plant, sensors)
-        self._columns = [column for column, k in enumerate(own) if k is not None]
-        self._read = [k for k in own if k is not None]
-        self._mean = drawn.mean(0)
-        centred = drawn - self._mean
-        self._gain = torch.linalg.pinv(centred[:, self._read]) @ centred
-        left = centred - centred[:, self._read] @ self._gain
-        scale = centred.abs().amax(0)
-        deviation = left.square().mean(0).sqrt()
-        self.spread = torch.where(deviation > 1e-9 * scale, deviation, 0.0)
-        self.spread[self._read] = torch.inf
-
-    def guess(self, record: SensorRecord) -> Float[Tensor, " n_s"]:
-        """The guess of a record's first state."""
-        first = record.readings[0, self._columns]
-        first = torch.where(first.isnan(), self._mean[self._read], first)
-        found = self._mean + (first - self._mean[self._read]) @ self._gain
-        found[self._read] = first
-        return found
 
 
 class Assimilate(Step):

@@ -81,11 +81,11 @@ class Judged(NamedTuple):
 
     Attributes:
         expected: the cost that is expected on the real system, extreme episodes included.
-        price: mean J_a on the twin, with the price of leaving bounds; it decides where extreme episodes diverge anyway.
+        on_twin: mean J_a on the twin, which decides where extreme episodes diverge anyway.
     """
 
     expected: float
-    price: float
+    on_twin: float
 
 
 class Anchors(NamedTuple):
@@ -211,8 +211,8 @@ class Belief:
 
     def judge(self, policy: nn.Module, episodes: Scenario) -> Judged:
         """What a policy costs, by its flights in virtual episodes and by the belief."""
-        cost, price = self.virtual.judge(policy, episodes)
-        return Judged(self.expected(policy, cost), price)
+        cost, on_twin = self.virtual.judge(policy, episodes)
+        return Judged(self.expected(policy, cost), on_twin)
 
     @torch.no_grad()
     def expected(self, policy: nn.Module, cost: float) -> float:

@@ -1,6 +1,5 @@
 """Hyper-parameters of the six steps."""
 
-from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Literal
 
@@ -8,7 +7,7 @@ from pydantic import Field
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.options import AtLeastOne, Count, NotNegative, Positive, Unbounded, configuration
+from rt_torchrl.options import AtLeastOne, Count, NotNegative, Positive, configuration
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 
@@ -81,29 +80,6 @@ class ExogenousConfig:
 
 
 @configuration
-class ConstraintsConfig:
-    r"""Bounds on states that plans shall keep.
-
-    They price what the twin predicts; a safety layer holds ``limits`` on the real system.
-
-    Args:
-        states: least and greatest value of states, by name, in their units; inf or -inf for no bound.
-        weight: weight of the price, in units of J_a of the first policy that is planned.
-
-    Raises:
-        ValueError: if a number is out of its range.
-    """
-
-    states: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
-    weight: Positive = 100.0
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in self.states.items():
-            if not low < high:
-                raise ValueError(f"constraints.states {name}={low} to {high} must have its least value first.")
-
-
-@configuration
 class PlannerConfig:
     """Parameters of step 5.
 
@@ -119,7 +95,6 @@ class PlannerConfig:
             plan made on one of them says little about the others.
         starts: number of random policies, the best of which is a start of ``multi_start``; 0 plans from the present
             weights alone.
-        constraints: bounds on states that plans keep.
         descent: parameters of the policy's descent.
         receding_horizon: parameters of model predictive control.
     """
@@ -128,16 +103,8 @@ class PlannerConfig:
     iterations: Count = 10
     realisations: AtLeastOne | None = None
     starts: Count = 32
-    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
-
-    def __post_init__(self) -> None:
-        if self.constraints.states and self.method not in ("multi_start", "single_start"):
-            raise ValueError(
-                f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
-                "planner.method as it is, or leave the constraints out."
-            )
 
 
 @configuration
@@ -172,9 +139,6 @@ class AssimilationConfig:
         method: method of the fit: ``adam`` with a rate of 0.1, ``lbfgs`` with a line search, or
             ``levenberg_marquardt``, which solves the normal equations from forward sensitivities, for closures of some
             ten weights.
-        starts: number of first weights in every episode: the present ones, those of the first closure, and then these
-            two in turns, moved at random. The best fit stays, as a law that has bent to one record may be in a local
-            minimum of the next ones. More than 1 needs ``levenberg_marquardt`` and ``initial="measured"``.
         prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
             perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
             keep their initial values, and so the law keeps its initial form where no record has been.
@@ -187,44 +151,21 @@ class AssimilationConfig:
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
-        sensors: names of the states and measurements that sensors read, to which the twin is fitted by maximum
-            likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
-            states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
-            the mean square of the residuals in units of the noise, and ``stop_below`` has no effect. Sensors need
-            ``levenberg_marquardt``, the inputs of the ``record`` and ``initial="estimated"``.
-        biased: names of the sensors that may be off by a constant, which is estimated.
     """
 
     iterations: Count = 15
     stop_below: NotNegative = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "adam"
-    starts: AtLeastOne = 1
     prior: NotNegative = 0.0
     segment: Count | None = None
     initial: Literal["measured", "estimated"] = "measured"
-    sensors: tuple[str, ...] = ()
-    biased: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
-            )
-        if self.sensors and (self.initial != "estimated" or self.segment):
-            raise ValueError(
-                f"sensors={self.sensors} of the assimilation need initial='estimated' and no segment; they are "
-                f"{self.initial!r} and {self.segment}."
-            )
-        if self.biased and not self.sensors:
-            raise ValueError(
-                f"biased={self.biased} of the assimilation belongs to a fit to sensors; give sensors, too."
-            )
-        if self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured"):
-            raise ValueError(
-                f"starts={self.starts} of the assimilation need method='levenberg_marquardt' and initial='measured', "
-                f"not {self.method!r} and {self.initial!r}."
             )
 
 

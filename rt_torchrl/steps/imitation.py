@@ -85,12 +85,12 @@ class Imitation:
         before, replaced = copy.deepcopy(idle.state_dict()), self.belief.judge(idle, judged_on)
         source = record if isinstance(live, StateFeedback) else seen()
         error = self.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
-        clone, price = self.belief.judge(idle, judged_on), self.virtual.price(live, judged_on)
-        found = {"distillation_error": error, "distillation_cost_ratio": clone.price / price}
+        clone, cost = self.belief.judge(idle, judged_on), self.virtual.cost(live, judged_on)
+        found = {"distillation_error": error, "distillation_cost_ratio": clone.on_twin / cost}
         if clone <= replaced:
             return findings(**found)
         idle.load_state_dict(before)
-        reason = f"clone refused: its J_a is {clone.price:.4g}, that of the policy it replaces {replaced.price:.4g}"
+        reason = f"clone refused: its J_a is {clone.on_twin:.4g}, that of the policy it replaces {replaced.on_twin:.4g}"
         return findings(reason, **found).set_non_tensor("event", "keep")
 
     def begin(

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
-from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.report import Step, record_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -264,7 +263,6 @@ class VirtualEpisodes:
         twin: twin on which the episodes are flown.
         config: parameters of the fit of a process to a real episode's exogenous input.
         experience: number of latest real episodes whose processes are kept.
-        constraints: bounds on states, whose price counts where policies are compared; None for none.
         extremes: number of random initial states whose extremes count where policies are compared; 0 for none.
         generator: source of every draw.
     """
@@ -275,11 +273,10 @@ class VirtualEpisodes:
         config: ExogenousConfig,
         experience: int,
         *,
-        constraints: Constraints | None = None,
         extremes: int = 0,
         generator: torch.Generator,
     ):
-        self.twin, self.config, self.constraints, self.generator = twin, config, constraints, generator
+        self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
         self.recorded: Tensor | None = None
         """Initial state of the last whole real episode."""
@@ -352,27 +349,18 @@ class VirtualEpisodes:
             return math.inf
         return cost if math.isfinite(cost) else math.inf
 
-    @torch.no_grad()
-    def price(self, policy: nn.Module, episodes: Scenario) -> float:
-        """Mean J_a, with the price of leaving the bounds if there are some."""
-        cost = self.cost(policy, episodes)
-        if self.constraints is None or not math.isfinite(cost) or isinstance(policy, StateFeedback):
-            return cost
-        flown = self.twin.control(policy, *episodes)
-        return self.constraints.priced(flown.states.new_full((len(flown.states),), cost), flown).mean().item()
-
     def judge(self, policy: nn.Module, episodes: Scenario) -> tuple[float, float]:
-        """The cost by which policies are compared, which counts failures in extreme episodes; and the price.
+        """The cost by which policies are compared, which counts failures in extreme episodes; and mean J_a.
 
         Extreme episodes begin with the extremes of each state, under the inputs of the others in turn. What they cost
-        beyond ten times the price counts as if one episode in a hundred were one. State feedback is asked for its price
-        alone, because model predictive control takes too long in further episodes.
+        beyond ten times J_a counts as if one episode in a hundred were one. State feedback is asked for J_a alone,
+        because model predictive control takes too long in further episodes.
         """
-        price = self.price(policy, episodes)
+        cost = self.cost(policy, episodes)
         if not len(self.extremes) or isinstance(policy, StateFeedback):
-            return price, price
-        beyond = self.price(policy, self._extreme(episodes)) - FAILURE * abs(price)
-        return price + RARE * max(0.0, beyond) if math.isfinite(price) else price, price
+            return cost, cost
+        beyond = self.cost(policy, self._extreme(episodes)) - FAILURE * abs(cost)
+        return cost + RARE * max(0.0, beyond) if math.isfinite(cost) else cost, cost
 
     def with_extremes(self, episodes: Scenario) -> Scenario:
         """Some episodes, and the extreme ones under their inputs, if there are some."""

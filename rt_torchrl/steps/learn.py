@@ -814,8 +814,8 @@ class Learn(Step):
             earlier = self.belief.judge(policy, judged_on)
             if found > earlier:
                 self.learner.restart()
-                reason = f"update refused: J_a of model_free would be {found.price:.4g}, it was {earlier.price:.4g}"
-                report = merged(report, findings(reason, update_accepted=0.0))
+                costs = f"J_a of model_free would be {found.on_twin:.4g}, it was {earlier.on_twin:.4g}"
+                report = merged(report, findings(f"update refused: {costs}", update_accepted=0.0))
             else:
                 policy.load_state_dict(after)
                 report = merged(report, findings(update_accepted=1.0))

@@ -1,6 +1,5 @@
 """Step 5: the planner improves π_mb on the twin from several starts; what is expected to cost least stays."""
 
-import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -15,7 +14,6 @@ from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, stuck
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
-from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -74,15 +72,11 @@ class WholeEpisodes:
         twin: twin with the best closure so far, w_p*.
         policy: policy π_mb, updated in place.
         config: parameters of step 5.
-
-    The attribute ``constraints`` prices what leaves the bounds of ``config.constraints``, if there are some, in the
-    plans and where the algorithm compares policies on the twin. A plan leaves its multipliers as they are.
     """
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
-        self.constraints = Constraints(twin.plant, config.constraints) if config.constraints.states else None
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
@@ -100,10 +94,7 @@ class WholeEpisodes:
         return stuck(before, after, gradient, weights, GRADIENT_LIMIT)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
-        if self.constraints is None:
-            costs = self.twin.expected_costs(self.policy, *episodes)
-        else:
-            costs = self.constraints.costs(self.twin, self.policy, episodes)
+        costs = self.twin.expected_costs(self.policy, *episodes)
         return limited_mean(costs, self.policy.parameters(), limit)
 
     def restart(self) -> None:
@@ -111,13 +102,10 @@ class WholeEpisodes:
         self.descent.restart()
 
     def state_dict(self) -> dict[str, Any]:
-        priced = {} if self.constraints is None else {"constraints": self.constraints.state_dict()}
-        return self.descent.state_dict() | priced
+        return self.descent.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if self.constraints is not None:
-            self.constraints.load_state_dict(state["constraints"])
-        self.descent.load_state_dict({name: part for name, part in state.items() if name != "constraints"})
+        self.descent.load_state_dict(state)
 
 
 class RecedingHorizonPlanner:
@@ -264,8 +252,7 @@ class MultiStart:
         policy = self.planner.policy
         if not self.judges:
             found = self._descended(planned_on)
-            found = findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
-            return merged(found, self._raised(planned_on))
+            return findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
         present = copy.deepcopy(policy.state_dict())
         self.belief.require_sound_twin(judged_on)
         stays = self.belief.judge(policy, judged_on)
@@ -283,7 +270,7 @@ class MultiStart:
             best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
             self.planner.restart()
-        return merged(best.report, self._raised(planned_on))
+        return best.report
 
     def _best(
         self, best: Plan, others: Iterable[tuple[int, Weights]], planned_on: Scenario, judged_on: Scenario
@@ -317,11 +304,11 @@ class MultiStart:
                 return Plan(present, stays, findings("no plan: the twin diverges", plan_accepted=0.0))
             report = found
             cost = self.belief.judge(policy, judged_on)
-            if cost <= stays and math.isfinite(cost.price):
+            if cost <= stays and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
             policy.load_state_dict(present)
             self.planner.restart()
-            if not len(self.virtual.extremes) or cost.price > stays.price:
+            if not len(self.virtual.extremes) or cost.on_twin > stays.on_twin:
                 break
             episodes = self.virtual.with_extremes(planned_on)
         return Plan(present, stays, report.update(findings(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])))
@@ -374,24 +361,11 @@ class MultiStart:
             drawn = self.make_policy(generator).state_dict()
             weights = {name: drawn[name] if name in trained else value for name, value in kept.items()}
             policy.load_state_dict(weights)
-            cost = self.virtual.price(policy, planned_on)
+            cost = self.virtual.cost(policy, planned_on)
             if cost < best[0]:
                 best = cost, weights
         policy.load_state_dict(kept)
         return best[1]
-
-    @torch.no_grad()
-    def _raised(self, episodes: Scenario) -> TensorDict:
-        """Raise the multipliers by the excess of the policy that stays, once all plans of this episode are judged.
-
-        Plans and what they would replace are so compared at the same price. What a refused plan exceeds is no matter.
-        """
-        constraints = self.virtual.constraints
-        if constraints is None:
-            return findings()
-        with contextlib.suppress(FloatingPointError):  # of a refused policy that diverges
-            constraints.update(self.virtual.twin.control(self.planner.policy, *episodes))
-        return findings(**constraints.report())
 
     def state_dict(self) -> dict[str, Any]:
         """The weights that later plans begin with, and for how many plans gradients have exploded."""

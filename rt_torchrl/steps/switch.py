@@ -164,7 +164,7 @@ class Switch(Step):
     """Step 6: the referee decides by what both policies cost over the same N virtual episodes.
 
     Reads ``record`` and the relative ``weight_changes`` of both policies. Writes ``event``, ``J_a_model_based`` and
-    ``J_a_model_free`` on the twin, with the price of leaving bounds.
+    ``J_a_model_free`` on the twin.
 
     Args:
         referee: the referee.
@@ -202,7 +202,7 @@ class Switch(Step):
         """
         judged_on, live, idle = self.belief.virtual.draw(self.count), self.referee.live, self.referee.idle
         costs = {role: self.belief.judge(self.policies[role], judged_on) for role in ROLES}
-        diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].price)]
+        diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].on_twin)]
         if diverged:
             self.belief.require_sound_twin(judged_on)
         evidence = Evidence(
@@ -213,7 +213,7 @@ class Switch(Step):
             real_costs=tuple(one.cost for one in self.belief.flown),
         )
         event = self.referee.decide(evidence)
-        report = findings(*diverged, **{f"J_a_{role}": costs[role].price for role in ROLES})
+        report = findings(*diverged, **{f"J_a_{role}": costs[role].on_twin for role in ROLES})
         report = report.update(findings(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
         if event == "clone":
             policies, record = (self.policies[live], self.policies[idle]), record_of(episode)

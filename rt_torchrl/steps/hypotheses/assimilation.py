@@ -22,7 +22,7 @@ from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import ResidualRates
-from rt_torchrl.steps.assimilate import Assimilation, SensorAssimilation
+from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.inputs import ExogenousProcess
@@ -439,17 +439,7 @@ def make_assimilation(
         config: parameters of step 4.
         hypotheses: parameters of the hypotheses.
         always: whether the twin alone is fitted in every episode; see :class:`EnsembleAssimilation`.
-
-    Raises:
-        ValueError: if hypotheses are to be fitted to some sensors alone, or the plant has no such sensor.
     """
-    if config.sensors and isinstance(twin, TwinEnsemble):
-        raise ValueError(
-            f"sensors={config.sensors} of the assimilation do not go with hypotheses, which replay "
-            "the whole state; leave the sensors out, or the hypotheses by hypotheses.which=none."
-        )
-    if config.sensors:
-        return SensorAssimilation(twin, config)
     if isinstance(twin, TwinEnsemble):
         return EnsembleAssimilation(twin, config, hypotheses, always=always)
     return Assimilation(twin, config)
