@@ -37,10 +37,11 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.steps.assimilate import Assimilate
+from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
-from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
+from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import TWICE, Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, RealFlights
@@ -140,7 +141,9 @@ class ReinforcementTwinning(TensorDictSequential):
         flights = RealFlights(env, actor, rollout, twin.plant)
         clearance = Clearance(system, policies, virtual, config.limits)
         interact = Interact(env, policies, flights, clearance, belief, config, judged)
-        assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
+        assimilation = Assimilation(twin, config.assimilation)
+        if isinstance(twin, TwinEnsemble):
+            assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
         planning, imitation = MultiStart(planner, belief, config.planner, make_policy), Imitation(belief, judged)
         count = config.planner.realisations or config.realisations
         steps: dict[str, Any] = {

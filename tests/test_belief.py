@@ -351,13 +351,3 @@ def test_roles_exchange_and_only_by_a_swap(live, other):
     assert (referee.live, referee.idle) == (other, live)
     referee = play(RefereeConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
     assert (referee.live, referee.idle) == (live, other)
-
-
-@pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "idle_weight_change"])))
-def test_nan_is_refused_and_leaves_the_counters(position, name):
-    referee = play(RefereeConfig(), [(WORSE, MOVING)])[1]
-    arguments = [1.0, 1.0, 1.0]
-    arguments[position] = math.nan
-    with pytest.raises(ValueError, match=f"{name} of step 6 is NaN"):
-        referee.decide(evidence(*arguments))
-    assert (referee.live, referee.worse_count, referee.stall_count) == ("model_free", 1, 0)

@@ -19,7 +19,7 @@ import rt_torchrl
 from rt_torchrl import check_plant
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -87,7 +87,7 @@ def test_the_extension_of_the_documentation_finds_a_leak():
     config = HypothesesConfig(call=0.0, which=("leaks", "pump lags"))
     twin = make_twin(tank, tank.make_closure(generator), config)
     fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
-    make_assimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)
+    EnsembleAssimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)
     found = twin.twins["leaks"].closure.named_coefficients()
     assert twin.weights == {"leaks": 1.0} and found["leak"].item() == pytest.approx(4e-3, rel=1e-3)
     assert found["lower_outlet"].item() == pytest.approx(4e-5, rel=1e-2)

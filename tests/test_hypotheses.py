@@ -19,7 +19,6 @@ from rt_torchrl.steps.hypotheses.assimilation import (
     Reread,
     counting,
     evidence,
-    make_assimilation,
     misfit,
     reread,
     with_hidden_states,
@@ -53,7 +52,7 @@ def ensemble(plant, call=0.0, *, always=False, **options):
     closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
     config = HypothesesConfig(call=call, **options)
     twin = make_twin(plant, closure, config)
-    return twin, make_assimilation(twin, ASSIMILATION, config, always=always)
+    return twin, EnsembleAssimilation(twin, ASSIMILATION, config, always=always)
 
 
 def fitted(real, plant, **options):

@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import re
 
 import numpy as np
 import pytest
@@ -285,19 +284,6 @@ def test_the_actor_climbs_the_value_of_its_actions():
     assert torch.equal(found.actor_adam.moments[0][0].sign(), slope.sign())
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "sac"])
-@pytest.mark.parametrize("value", [float("nan"), -1e86])
-@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation"), ("next", "reward")])
-def test_a_transition_that_is_not_finite_is_refused_by_name(algorithm, key, value):
-    found, data = learner(algorithm), explored(2)
-    before = copy.deepcopy(found.state_dict())
-    data[key][3, -1] = value
-    with pytest.raises(ValueError, match=re.escape(f"{key!r} of transition 3 is {value:g}")):
-        found.store(data)
-    assert not len(found.memory)
-    assert_equal(found.state_dict()["loss"], before["loss"])
-
-
 @pytest.mark.parametrize(("algorithm", "rates"), [("ddpg", {"kind": Wild}), ("sac", {"actor_rate": 1e308})])
 def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(algorithm, rates):
     """A second step of 1e308 overflows."""
@@ -558,16 +544,6 @@ def test_eviction_goes_by_the_present_priorities():
     assert labels(found)[:4] == [2.0, 3.0, 4.0, 5.0] and 8.0 in labels(found) and len(found) == 6
     drawn = found.sample(2000)["label"]
     assert {2.0, 3.0, 4.0, 5.0, 8.0} <= set(drawn.tolist()) and drawn.mode().values == 8.0
-
-
-def test_a_single_transition_takes_the_place_of_the_least_one_too():
-    """TorchRL's ``add`` after ``store``: a free place first, then that of the least priority."""
-    found = memory(capacity=3)
-    found.store(labelled([0.0, 1.0]), torch.tensor([5.0, 1.0]))
-    assert found.buffer.add(labelled([2.0])[0]) == 2
-    found.refresh(torch.tensor([2]), torch.tensor([3.0]))
-    assert found.buffer.add(labelled([3.0])[0]) == 1
-    assert labels(found) == [0.0, 2.0, 3.0]
 
 
 def test_state_round_trip_samples_the_same():

@@ -21,7 +21,7 @@ from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import make_assimilation
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.engines.interval import Interval
 from rt_torchrl.trajectories.engines.parallel import as_one_batch
@@ -210,7 +210,7 @@ def records(real, noise, count=3):
 def learned(real, names, noise=0.0):
     plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, which=names)
     twin = make_twin(plant, LinearClosure([[0.0, 0.0], [0.0, 0.0]]), config)
-    assimilation = make_assimilation(twin, ASSIMILATION, config)
+    assimilation = EnsembleAssimilation(twin, ASSIMILATION, config)
     assimilation.update(list(records(real, noise)), (), 1, torch.Generator())
     return twin, assimilation.misfits
 

@@ -12,7 +12,7 @@ from test_first_controller import begun
 
 from rt_torchrl import RefereeConfig
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.optimisers.descent import Descended, DescentConfig, stuck
+from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.steps import plan
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
@@ -182,9 +182,9 @@ def test_a_plan_that_is_stuck_is_made_from_other_weights_too(limit, led_back, mo
     ("before", "after", "promised", "expected"),
     [(1.0, 1.0, 1e3, True), (1.0, 0.5, 1e3, False), (1.0, 1.0, 1.0, False), (-1.0, -1.0, 1e3, True)],
 )
-def test_a_descent_is_stuck_where_it_gains_nothing_of_what_its_gradient_promises(before, after, promised, expected):
-    weights = [torch.tensor([3.0, 4.0])]
-    assert stuck(before, after, promised / 5.0, weights, limit=10.0) is expected
+def test_a_descent_stalls_where_it_gains_nothing_of_what_its_gradient_promises(before, after, promised, expected):
+    planner = Still(LinearGain([[3.0, 4.0]]), belief_of().virtual)
+    assert planner.stalled(before, after, promised / 5.0) is expected
 
 
 def test_extreme_starts_are_beyond_nearly_all_random_ones():

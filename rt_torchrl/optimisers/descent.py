@@ -1,5 +1,6 @@
 """The gradient descent of steps 4 and 5, which takes a few iterations at a time and keeps the best weights."""
 
+import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterable
@@ -95,26 +96,6 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     return found
 
 
-NOTHING = 1e-3
-"""Share of a cost that a descent must gain, where its gradient promises much more."""
-
-
-def stuck(before: float, after: float, gradient: float, weights: list[Tensor], limit: float) -> bool:
-    r"""Whether a descent gained nothing, although its first gradient promised more than is believable.
-
-    A gradient promises :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along it.
-
-    Args:
-        before: cost at the start.
-        after: cost at the end.
-        gradient: norm of the first gradient g.
-        weights: weights w.
-        limit: greatest believable promise, in units of the cost.
-    """
-    promised = gradient * norm_of(weights).item()
-    return before - after <= NOTHING * abs(before) and promised > limit * abs(before)
-
-
 class Descent:
     """Updates the weights of a module in place and leaves the best weights in it.
 
@@ -127,7 +108,7 @@ class Descent:
         second_moment: β₂ of Adam.
     """
 
-    _optimiser: torch.optim.Adam | torch.optim.LBFGS
+    _optimiser: torch.optim.Optimizer
 
     def __init__(self, module: nn.Module, config: DescentConfig, *, second_moment: float = 0.9):
         self.module, self.config, self.second_moment = module, config, second_moment
@@ -154,27 +135,24 @@ class Descent:
         Raises:
             FloatingPointError: if the cost diverges at the weights that the descent starts from.
         """
-        seen = _Seen(self.module, cost, self.config, iterations, stop_below)
+        trials = _Trials(self.module, cost, self.config, iterations, stop_below)
         try:
             if self.config.optimiser == "lbfgs":
                 # Another episode has another cost: the curvature of the last one would mislead the line search.
                 self.restart()
                 self._optimiser.param_groups[0].update(max_iter=iterations, max_eval=iterations)
-                self._optimiser.step(seen.or_infinite)  # its line search has evaluated the weights that it ends at
+                self._optimiser.step(trials)  # its line search has evaluated the weights that it ends at
             else:
                 for _ in range(iterations):
-                    self._adam_step(seen)
-                seen.note_last()
+                    if math.isfinite(trials()):
+                        self._optimiser.step()
+                    else:
+                        trials.halve_step()
+                trials.note_last()
         except _Finished:
             pass
-        self.module.load_state_dict(seen.best_weights)
-        return Descended(seen.start, seen.best, seen.gradient, seen.count)
-
-    def _adam_step(self, seen: "_Seen") -> None:
-        try:
-            self._optimiser.step(seen)
-        except _Diverged:
-            seen.halve_step()
+        self.module.load_state_dict(trials.best_weights)
+        return Descended(trials.start, trials.best, trials.gradient, trials.count)
 
     def state_dict(self) -> dict[str, Any]:
         return self._optimiser.state_dict()
@@ -204,11 +182,7 @@ class _Finished(Exception):
     """The run has ended, although the optimiser would go on."""
 
 
-class _Diverged(Exception):
-    """Cost or gradient is not finite at the present weights, which are not the first weights of the run."""
-
-
-class _Seen:
+class _Trials:
     """The function that an optimiser calls for cost and gradient; it remembers the best weights."""
 
     def __init__(
@@ -219,25 +193,37 @@ class _Seen:
         iterations: int,
         stop_below: float,
     ):
-        self._module, self._cost, self._config = module, cost, config
+        self._module, self._cost = module, cost
+        self._limit = config.gradient_limit if config.optimiser == "adam" else math.inf
         self._iterations, self._stop_below = iterations, stop_below
-        self.start = self.best = float("nan")
-        self.gradient, self.count = float("nan"), 0
+        self.start = self.best = math.nan
+        self.gradient, self.count = math.nan, 0
         self.best_weights = copy.deepcopy(module.state_dict())
         self._weights = [w for w in module.parameters() if w.requires_grad]
         self._sound: list[Tensor] = []  # weights of the last cost that was finite
 
-    def __call__(self) -> Tensor:
-        if self.count == self._iterations:
+    def __call__(self) -> float:
+        """The cost over that at the start, with its gradient; infinite, with NaN for the gradient, where it diverges.
+
+        The square of an exploding gradient overflows, and leaves L-BFGS without a direction: whatever it would try from
+        then on is NaN, so that the run ends. Where a slope is NaN, its line search halves its bracket.
+
+        Raises:
+            FloatingPointError: if the first cost diverges.
+        """
+        stray = self.count and not all(w.isfinite().all() for w in self._weights)
+        if stray or self.count == self._iterations:
             raise _Finished
         safe_point()
         try:
             relative, cost, norm = self._differentiated()
-        except FloatingPointError as error:
+        except FloatingPointError:
             if self.count == 0:
                 raise
             self.count += 1
-            raise _Diverged from error
+            for weight in self._weights:
+                weight.grad = torch.full_like(weight, math.nan)
+            return math.inf
         if self.count == 0:
             self.gradient = norm * (abs(self.start) or 1.0)
         self._sound = [w.detach().clone() for w in self._weights]
@@ -245,29 +231,13 @@ class _Seen:
         self._note(cost)
         return relative
 
-    def or_infinite(self) -> Tensor:
-        """The relative cost for a line search, which is infinite where a trial diverges.
-
-        The square of an exploding gradient overflows, and leaves L-BFGS without a direction: whatever it would try from
-        then on is NaN, so that the run ends.
-        """
-        if self.count and not all(w.isfinite().all() for w in self._weights):
-            raise _Finished
-        try:
-            return self()
-        except _Diverged:
-            # Where a slope is NaN, torch's line search halves its bracket instead of interpolating.
-            for weight in self._weights:
-                weight.grad = torch.full_like(weight, float("nan"))
-            return torch.tensor(float("inf"), dtype=torch.float64, device=self._weights[0].device)
-
     @torch.no_grad()
     def halve_step(self) -> None:
         """Go half the way back to the last weights with a finite cost."""
         for weight, sound in zip(self._weights, self._sound, strict=True):
             weight.lerp_(sound, 0.5)
 
-    def _differentiated(self) -> tuple[Tensor, float, float]:
+    def _differentiated(self) -> tuple[float, float, float]:
         """Relative cost, cost, and norm of the gradient; the gradient itself is left in the weights.
 
         Raises:
@@ -283,25 +253,20 @@ class _Seen:
             relative = cost / (abs(self.start) or 1.0)
             relative.backward()
         weights = [w for w in self._module.parameters() if w.grad is not None]
-        limit = self._config.gradient_limit if self._config.optimiser == "adam" else float("inf")
-        norm = nn.utils.clip_grad_norm_(weights, limit).item()
+        norm = nn.utils.clip_grad_norm_(weights, self._limit).item()
         if not (math.isfinite(value) and math.isfinite(norm)):
             raise FloatingPointError(
                 f"cost={value:g} of {type(self._module).__name__} with a relative gradient of norm {norm:g} is not "
                 "finite; start the descent from weights whose cost and gradient are."
             )
-        return relative, value, norm
+        return relative.item(), value, norm
 
+    @torch.no_grad()
     def note_last(self) -> None:
         """Consider the weights of Adam's last step too; Adam has not evaluated them."""
-        if not self.count:
-            return
-        try:
-            with torch.no_grad():
-                cost = self._cost().item()
-        except FloatingPointError:
-            return  # these are not the best weights
-        self._note(cost)
+        if self.count:
+            with contextlib.suppress(FloatingPointError):  # these are not the best weights
+                self._note(self._cost().item())
 
     def _note(self, cost: float) -> None:
         if cost < self.best or math.isnan(self.best):

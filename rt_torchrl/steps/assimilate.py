@@ -50,11 +50,6 @@ class Assimilation:
     """
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
-        if (config.segment or 0) > twin.plant.n_steps:
-            raise ValueError(
-                f"segment={config.segment} of the assimilation exceeds the {twin.plant.n_steps} control intervals of "
-                f"an episode of plant {twin.plant.name!r}; 0 replays whole records."
-            )
         self.twin, self.config = twin, config
         lbfgs = DescentConfig(optimiser="lbfgs", rate=1.0)
         self.descent = Descent(twin.closure, lbfgs if config.method == "lbfgs" else DescentConfig())

@@ -83,34 +83,21 @@ class Flight(NamedTuple):
         rewards, (count, each) = self.transitions["next", "reward"], self.after
         return -(rewards.sum() - count * each) / (len(rewards) + count)
 
-    @property
-    def sound_intervals(self) -> int:
-        """Number of control intervals that are learned from."""
-        return sum(map(len, self.parts))
 
-    def report(self) -> TensorDict:
-        """The cost, the faults, and how often and why the episode was flown again."""
-        found = findings(real_cost=self.cost, reward=-self.cost)
-        if self.refused:
-            found.update(findings(episodes_refused=float(len(self.refused))))
-            found.set_non_tensor("refusal", "; ".join(self.refused))
-        if self.faults:
-            counts = Counter(fault.kind for fault in self.faults)
-            found.update(findings(**{f"faults/{kind}": float(count) for kind, count in counts.items()}))
-        if self.ended:
-            found.update(findings(ended_after=float(len(self.transitions))))
-        if not self.whole:
-            found.update(findings(sound_intervals=float(self.sound_intervals)))
-        return found
-
-
-def together(flights: Sequence[Flight]) -> TensorDict:
-    """The report of the flights of one episode of the algorithm, with the faults of all of them."""
-    refused, faults = ([each for flight in flights for each in getattr(flight, name)] for name in ("refused", "faults"))
-    report = flights[-1]._replace(refused=refused, faults=faults).report()
+def report_of_flights(flights: Sequence[Flight]) -> TensorDict:
+    """The cost of the last of some flights, the faults of all, and how often and why they were flown again."""
+    last = flights[-1]
+    found = findings(real_cost=last.cost, reward=-last.cost)
+    refused = [reason for flight in flights for reason in flight.refused]
+    if refused:
+        found.update(findings(episodes_refused=float(len(refused)), refusal="; ".join(refused)))
+    kinds = Counter(fault.kind for flight in flights for fault in flight.faults)
+    found.update(findings(**{f"faults/{kind}": float(count) for kind, count in kinds.items()}))
+    if last.ended:
+        found.update(findings(ended_after=float(len(last.transitions))))
     if not all(flight.whole for flight in flights):
-        report.update(findings(sound_intervals=float(sum(flight.sound_intervals for flight in flights))))
-    return report
+        found.update(findings(sound_intervals=float(sum(len(part) for flight in flights for part in flight.parts))))
+    return found
 
 
 def flown(flights: Sequence[Flight]) -> TensorDict:
@@ -389,7 +376,7 @@ class Operating:
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])
         cost = torch.stack([flight.cost for flight in flights]).mean()
-        report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
+        report = report_of_flights(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
         merged(report, findings(**(order.found or {}))).update(findings(**(self.operation.acted or {})))
         counted = [self.step.clearance.counted(flight.record) for flight in flights]
@@ -460,7 +447,7 @@ class Interact(Step):
         explored = self.flights.actor.strength * self.config.exploration.spread
         if flight.whole:  # costs of parts cannot be compared with those of episodes
             self.belief.append(flight.record, cleared.role, flight.cost.item(), explored, acting.state_dict())
-        report = merged(flight.report(), findings(exploration=self.flights.actor.strength))
+        report = merged(report_of_flights([flight]), findings(exploration=self.flights.actor.strength))
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
         return [flight], report.set_non_tensor("live", cleared.role)

@@ -38,7 +38,6 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
-from rt_torchrl.systems.sound_part import finite_errors, finite_transitions
 
 
 @runtime_checkable
@@ -293,13 +292,9 @@ class ActorCritic:
         self._traced = copy.deepcopy(policy)
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep the transitions of a real episode, with their TD errors as priorities.
-
-        Raises:
-            ValueError: if a number of the episode is not finite, or a TD error, because the critic has diverged.
-        """
-        transitions = self.transitions(finite_transitions(episode.select(*TRANSITION)))
-        self.memory.store(transitions, finite_errors(self.td_errors(transitions)))
+        """Keep the transitions of a real episode, with their TD errors as priorities."""
+        transitions = self.transitions(episode)
+        self.memory.store(transitions, self.td_errors(transitions))
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
         """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
@@ -743,10 +738,6 @@ class LeastPriorityWriter(RoundRobinWriter):
         super().__init__()
         self.priorities = np.zeros(capacity, dtype=np.float32)
         """Priority of the transition in each place; of equal ones the first goes first."""
-
-    def add(self, data: TensorDictBase) -> int:
-        """Write one transition in its place, which is returned."""
-        return int(self.extend(data.unsqueeze(0))[0])
 
     def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
         """Write transitions in their places, which are returned.

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.control.predictive_control import PredictiveControl
-from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, stuck
+from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, norm_of
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
@@ -25,6 +25,8 @@ SEVERAL = (1, 2, 4)
 GRADIENT_LIMIT = 10.0
 """Limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second descent over whole episodes
 where the first one gains nothing beside a mean gradient that is longer."""
+NOTHING = 1e-3
+"""Share of a cost that a descent must gain, where its gradient promises much more."""
 STRIDE = 1_000_003
 """Difference of the seeds of the random policies of two episodes."""
 SEEDS = 2**63
@@ -87,11 +89,14 @@ class WholeEpisodes:
         return found
 
     def stalled(self, before: float, after: float, gradient: float) -> bool:
-        """Whether a plan gained nothing although its first gradient exceeds the limit."""
+        r"""Whether a plan gained nothing, although its first gradient promised more than is believable.
+
+        It promises :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along it.
+        """
         if self.config.method == "single_start":
             return False
-        weights = [w.detach() for w in self.policy.parameters() if w.requires_grad]
-        return stuck(before, after, gradient, weights, GRADIENT_LIMIT)
+        promised = gradient * norm_of([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
+        return before - after <= NOTHING * abs(before) and promised > GRADIENT_LIMIT * abs(before)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.twin.expected_costs(self.policy, *episodes)

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -21,8 +20,7 @@ STALL = 0.5
 """Relative weight change T_w below which the idle policy has stalled; P_w decides how soon that makes it a clone."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evidence:
+class Evidence(NamedTuple):
     """Evidence about the two policies after an episode.
 
     Args:
@@ -31,20 +29,12 @@ class Evidence:
         idle_cost: the same of the idle policy over the same virtual episodes; infinite if the twin diverges with it.
         idle_weight_change: relative change ‖w^i − w^{i−1}‖/‖w^i‖ of the idle policy's weights over this episode.
         real_costs: J_a of the latest real episodes, oldest first.
-
-    Raises:
-        ValueError: if a cost or the weight change is not a number.
     """
 
     live_cost: float
     idle_cost: float
     idle_weight_change: float
     real_costs: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        for argument in ("live_cost", "idle_cost", "idle_weight_change"):
-            if math.isnan(getattr(self, argument)):
-                raise ValueError(f"{argument} of step 6 is NaN; look at the virtual episodes it was computed from.")
 
 
 @runtime_checkable

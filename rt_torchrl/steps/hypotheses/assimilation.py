@@ -427,19 +427,3 @@ def evidence(misfits: dict[str, float]) -> dict[str, float]:
     }
     greatest = max(weights.values())
     return {name: weight / greatest for name, weight in weights.items()}
-
-
-def make_assimilation(
-    twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig, *, always: bool = False
-) -> Assimilation:
-    """Step 4 for a twin, or for an ensemble of them.
-
-    Args:
-        twin: the twin.
-        config: parameters of step 4.
-        hypotheses: parameters of the hypotheses.
-        always: whether the twin alone is fitted in every episode; see :class:`EnsembleAssimilation`.
-    """
-    if isinstance(twin, TwinEnsemble):
-        return EnsembleAssimilation(twin, config, hypotheses, always=always)
-    return Assimilation(twin, config)
