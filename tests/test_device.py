@@ -270,6 +270,12 @@ def test_real_system_and_td3(train):
 
 
 @pytest.mark.slow
+def test_unknown_system(train):
+    """The physics that the twin believes are not those of the real system, and must be moved too."""
+    train("wind_turbine", horizon=4.0, unknown=("pitch",), policy="scheduled")
+
+
+@pytest.mark.slow
 def test_figures_perceptrons_and_distillation(train, tmp_path):
     train("wind_turbine", horizon=4.0, figures=True, episodes=2, **NEURAL)
     assert "clone" in [episode["event"] for episode in json.loads((tmp_path / "metrics.json").read_text())["episodes"]]

@@ -137,7 +137,7 @@ class Run:
         compiled = not native and can_compile(device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
-        physics = known_physics(config, plant, believed, real, first, baselines)
+        physics = known_physics(config, plant, believed, real, first, baselines).to(device)
         laws = dict(baselines or {})
         if config.start == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first

@@ -56,8 +56,8 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     if name == "controller":
         if controller is None:
             raise ValueError("start='controller' needs the controller: give Run(..., first=...), or start='random'.")
-        law = controller(plant)
-        return lambda physics, closure: FirstController(law.to(_device_of(physics, closure)))
+        law = controller(plant).to(config.device)
+        return lambda physics, closure: FirstController(law)
     if name == "mpc":
         options = config.twinning.planner.receding_horizon
         return lambda physics, closure: FirstController(PredictiveControl(physics, closure, options))
@@ -101,10 +101,9 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
-        device = _device_of(physics, closure)
         return EarlierPolicies(
-            {role: policy.to(device) for role, policy in policies.items()},
-            run.closure.to(device),
+            {role: policy.to(config.device) for role, policy in policies.items()},
+            run.closure.to(config.device),
             _live(folder),
             hypotheses,
         )
@@ -162,15 +161,9 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
     records = pieces_of_equal_length(segments, physics.n_steps, physics.dt)
 
     def start(physics: Plant, closure: nn.Module) -> RecordedFlights:
-        device = _device_of(physics, closure)
-        return RecordedFlights(physics, [record.mapped(lambda part: part.to(device)) for record in records])
+        return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
 
     return start
-
-
-def _device_of(*modules: nn.Module) -> torch.device:
-    parts = (part for module in modules for part in (*module.parameters(), *module.buffers()))
-    return next((part.device for part in parts), torch.device("cpu"))
 
 
 CHECKED_STEPS = 10
