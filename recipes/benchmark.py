@@ -44,7 +44,6 @@ class Config:
         horizons: numbers of control intervals.
         realisations: numbers of trajectories N_z; each is timed with each horizon.
         engines: gradient engines; ratios are over the first one. An engine that cannot roll a plant out is left out.
-        compiled: compile with torch.compile what an engine leaves to torch.
         threads: number of CPU threads. On one thread the times are CPU times, which other processes on the machine
             change least; on more threads they are wall times.
         repeats: number of turns behind a median, each of calls for a tenth of a second, at least one.
@@ -58,7 +57,6 @@ class Config:
     horizons: tuple[AtLeastOne, ...] = (100, 1_000, 10_000)
     realisations: tuple[AtLeastOne, ...] = (5, 25)
     engines: tuple[Engine, ...] = get_args(Engine)
-    compiled: bool = False
     threads: AtLeastOne = 1
     repeats: AtLeastOne = 5
     limit: Positive = 2.0
@@ -137,9 +135,9 @@ def system_of(name: PlantName, policy: Policy) -> System:
     return System(plant, closure, made)
 
 
-def engine_of(engine: Engine, system: System, *, compiled: bool) -> Contender:
+def engine_of(engine: Engine, system: System) -> Contender:
     """An engine of the library, called as a planner calls it."""
-    rollout, weights = Rollout(*system, engine=engine, compiled=compiled), list(system.policy.parameters())
+    rollout, weights = Rollout(*system, engine=engine), list(system.policy.parameters())
 
     def calls(scenario: Scenario) -> Calls:
         @torch.no_grad()
@@ -159,7 +157,7 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
     """The times of all contenders on one plant, the smaller sizes first."""
     system, rows = system_of(name, config.policy), list[Row]()
     contenders = {
-        engine: engine_of(engine, system, compiled=config.compiled)
+        engine: engine_of(engine, system)
         for engine in config.engines
         if refusal(engine, system.plant) is None
     }

@@ -68,7 +68,7 @@ def identified(data: Path, folder: Path) -> float:
 
 
 class Result(NamedTuple):
-    """What a training ended with: costs of the live and of the cheaper policy on unseen episodes, Σ, seconds.
+    """What a training ended with: costs of the live and of the cheaper policy on unseen episodes, Σ, alarms, seconds.
 
     Σ is the sum of J_a of its real episodes, without that of the controller that flew before them.
     """
@@ -76,28 +76,30 @@ class Result(NamedTuple):
     live: float
     cheaper: float
     paid: float
+    alarms: int
     seconds: float
 
     @classmethod
     def of(cls, folder: Path) -> "Result":
         metrics = json.loads((folder / "metrics.json").read_text())
-        summary, paid = metrics["summary"], sum(episode["real_cost"] for episode in metrics["episodes"])
+        summary, episodes = metrics["summary"], metrics["episodes"]
+        paid, alarms = sum(one["real_cost"] for one in episodes), sum(one["alarm"] > 0.0 for one in episodes)
         costs = {role: summary["unseen"][f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
         seconds = json.loads((folder / "seconds.json").read_text())
-        return cls(costs[summary["live"]], min(costs.values()), paid, seconds)
+        return cls(costs[summary["live"]], min(costs.values()), paid, alarms, seconds)
 
 
 def line(name: str, results: list[Result]) -> str:
-    """A row of the table: least and greatest over seeds, and the median of the seconds."""
+    """A row of the table: least and greatest over seeds, alarms of all, and the median of the seconds."""
 
     def span(values: list[float], digits: int = 5) -> str:
         least, greatest = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
         return least if least == greatest else f"{least} … {greatest}"
 
-    live, cheaper, paid, seconds = (list(values) for values in zip(*results, strict=True))
+    live, cheaper, paid, alarms, seconds = (list(values) for values in zip(*results, strict=True))
     dearer = sum(one.live > 1.001 * one.cheaper for one in results)
     time = f"{statistics.median(seconds):.0f}"
-    return f"| {name} | {len(results)} | {span(live)} | {span(cheaper)} | {dearer} | {span(paid, 4)} | {time} |"
+    return f"| {name} | {len(results)} | {span(live)} | {span(cheaper)} | {dearer} | {span(paid, 4)} | {sum(alarms)} | {time} |"
 
 
 def main() -> None:
@@ -118,8 +120,8 @@ def main() -> None:
         for (name, seed), training in running.items():
             training.result()
             print(f"{name}, seed {seed}: {Result.of(tasks[name, seed])}", file=sys.stderr, flush=True)
-    print("| system | seeds | J_a of the live policy | J_a of the cheaper policy | live is dearer | Σ | seconds |")
-    print("|---|---|---|---|---|---|---|")
+    print("| system | seeds | J_a of the live policy | J_a of the cheaper policy | live is dearer | Σ | alarms | seconds |")
+    print("|---|---|---|---|---|---|---|---|")
     for name in options.rows:
         print(line(name, [Result.of(tasks[name, seed]) for seed in seeds]))
     if options.tanks:
