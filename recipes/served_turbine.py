@@ -1,8 +1,11 @@
-"""A wind turbine served over OPC UA or Modbus: reinforcement twinning while it operates, or a policy at work."""
+"""A wind turbine behind OPC UA or Modbus: reinforcement twinning while it operates."""
 
-import contextlib
+import asyncio
+import dataclasses
+import logging
+import math
+import struct
 import time
-from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,131 +15,182 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
+import torch
 from pydantic import Field
 from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures
 
-from rt_torchrl import OperationConfig, configuration, main_of
-from rt_torchrl.atomic_file import make_folder, write_results
+from rt_torchrl import OperationConfig, Plant, SafetyConfig, configuration, main_of
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.options import File, Positive
+from rt_torchrl.options import Positive
+from rt_torchrl.plants.plant import with_memories
+from rt_torchrl.plants.signal import bounds
 
+HOST, WRITTEN_AT = "127.0.0.1", 1000
+"""Address of the server, and of the first register that a client writes; those that it reads begin at 0."""
 SAFE = (2e4, 20.0)
 """Torque [N m] and pitch [deg] that slow the rotor down in any wind, and do not stop it."""
 
 
-def in_operation() -> OperationConfig:
-    """The turbine never stops, and keeps its own time."""
-    return OperationConfig(clock="wall", continuous=True)
-
-
 @configuration
 class Config(Turbine):
-    """Train twin and controllers on a wind turbine at the other end of a protocol, while it operates.
+    """Train twin and controllers on a wind turbine at the other end of a protocol, while it operates without a stop.
 
-    A server process simulates the turbine and never waits; this process connects to it as a client would to a machine.
-    The policies are judged in simulation.
+    The server, which is this recipe with serve, simulates the turbine and never waits; start it first. The policies are
+    judged in simulation.
 
     Args:
         protocol: what the server speaks, opcua or modbus.
         port: port of the server on this machine.
-        connect: whether a server runs already, started with serve; it must have the same dt, pace and observe.
-        serve: whether to run the server alone, until Ctrl-C.
-        act: exported policy that acts for one horizon, without a learner: an ONNX model (.onnx, with the extra export),
-            or with trusted a PyTorch program (.pt2) or C (.c, with a C compiler). The results, in_service.json, and the
-            events of the safety layer, safety.jsonl, go to log_dir.
-        trusted: whether a .pt2 or .c file may run its code, because you know who has written it.
+        serve: whether to be the server, until Ctrl-C; dt, pace and observe must be those of the training.
         pace: seconds of the turbine for each second: with the default, the control period of 0.5 s lasts 0.02 s.
-        safe: generator torque [N m] and blade pitch [deg] that the turbine's own watchdog brings, and the client's
-            fallback.
     """
 
-    asynchronous: bool = True
-    operation: OperationConfig = field(default_factory=in_operation)
     protocol: Literal["opcua", "modbus"] = "modbus"
     port: Annotated[int, Field(ge=1, le=65535)] = 5020
-    connect: bool = False
     serve: bool = False
-    act: File | None = None
-    trusted: bool = False
     pace: Positive = 25.0
-    safe: tuple[float, float] = SAFE
 
     def __post_init__(self):
         super().__post_init__()
-        if self.asynchronous and self.operation.clock != "wall":
-            raise ValueError("operation.clock must be wall: a served plant keeps its own time and does not wait.")
-        for option, usual in (("real", "simulation"), ("unknown", ()), ("model_error", False)):
-            value = getattr(self, option)
-            if value != usual:
-                raise ValueError(
-                    f"{option}={value!r} is another real system; the served one is the simulation that its twin knows. "
-                    f"Leave {option} out, or take recipes/wind_turbine.py."
-                )
-        if self.serve and (self.connect or self.act is not None):
-            raise ValueError(
-                "serve=True runs the server alone, and connect and act are options of a client; give them to another "
-                "process."
-            )
+        if self.real != "simulation" or self.unknown or self.model_error:
+            raise ValueError("real, unknown and model_error are other real systems; take recipes/wind_turbine.py.")
 
-    @staticmethod
-    def usual_operation() -> OperationConfig:
-        return in_operation()
 
-    def served(self) -> dict[str, Any]:
-        """Arguments of server and client."""
-        return {"safe": self.safe, "protocol": self.protocol, "port": self.port, "period": self.dt / self.pace}
+class ServedPlant:
+    """A simulated plant that never stops; its watchdog brings the safe action in an interval without a valid command.
+
+    A client reads the tags ``sample``, ``state.NAME``, ``exogenous.NAME`` and ``applied.NAME``. It writes
+    ``command.NAME`` and ``answered``, the number of the sample that its commands answer.
+    """
+
+    def __init__(self, plant: Plant, safe: tuple[float, ...], *, seed: int = 0):
+        kinds = {"state": plant.readings, "exogenous": plant.inputs, "applied": plant.actions}
+        self.entries = {kind: [f"{kind}.{signal.name}" for signal in signals] for kind, signals in kinds.items()}
+        self.read = ["sample", *(tag for tags in self.entries.values() for tag in tags)]
+        self.written = [*(f"command.{action.name}" for action in plant.actions), "answered"]
+        self.plant, self.safe, self.sample = plant, torch.tensor([safe], dtype=torch.float64), 1
+        self._generator = torch.Generator().manual_seed(seed)
+        self._state, self._applied = plant.draw_initial_state(1, self._generator), torch.zeros_like(self.safe)
+        self._inputs, self._k = plant.draw_exogenous(1, self._generator), 0
+
+    def published(self) -> dict[str, float]:
+        """The tags that a client reads, at the beginning of an interval."""
+        seen = self._state[:, : len(self.plant.readings)], self._inputs[:, self._k], self._applied
+        return dict(zip(self.read, [float(self.sample), *torch.cat(seen, -1)[0].tolist()], strict=True))
+
+    @torch.no_grad()
+    def advance(self, command: list[float], answered: float) -> None:
+        """Run one interval under the command, or under the safe action."""
+        asked, (low, high) = torch.tensor([command], dtype=torch.float64), bounds(self.plant.actions)
+        valid = answered == self.sample and bool(((asked >= low) & (asked <= high)).all())  # NaN is not
+        t, state, z = torch.tensor([self._k * self.plant.dt]).double(), self._state, self._inputs[:, self._k]
+        step = self.plant.step(t, state, asked if valid else self.safe, z, self.plant.closure)
+        self._state, self._applied = with_memories(self.plant, step.state, t, state, z), step.applied
+        self.sample, self._k = self.sample + 1, self._k + 1
+        if self._k == self.plant.n_steps:
+            self._inputs, self._k = self.plant.draw_exogenous(1, self._generator), 0
+
+
+async def opcua(served: ServedPlant, port: int):
+    """Start a server; its functions that show what clients read, and that give what they have written."""
+    from asyncua import Server, ua
+
+    server, nodes = Server(), {}
+    await server.init()
+    server.set_endpoint(f"opc.tcp://{HOST}:{port}")
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    await server.register_namespace("urn:rt_torchrl:plant")
+    for tag in (*served.read, *served.written):
+        nodes[tag] = await server.nodes.objects.add_variable(ua.NodeId.from_string(f"ns=2;s={tag}"), tag, math.nan)
+    for tag in served.written:
+        await nodes[tag].set_writable()
+    await server.start()
+
+    async def show(values):
+        for tag, value in values.items():
+            await nodes[tag].write_value(value)
+
+    async def asked():
+        return [float(await nodes[tag].read_value()) for tag in served.written]
+
+    return server.stop, show, asked
+
+
+async def modbus(served: ServedPlant, port: int):
+    """The same over Modbus, with a double in four registers for each tag."""
+    from pymodbus import simulator
+    from pymodbus.server import ModbusTcpServer
+
+    count, kind = len(served.written), simulator.DataType.REGISTERS
+    sizes = {0: len(served.read), WRITTEN_AT: count}
+    blocks = [simulator.SimData(first, values=[0] * 4 * size, datatype=kind) for first, size in sizes.items()]
+    server = ModbusTcpServer(simulator.SimDevice(id=1, simdata=blocks), address=(HOST, port))
+    await server.serve_forever(background=True)
+
+    async def show(values):
+        words = struct.unpack(f">{4 * len(values)}H", struct.pack(f">{len(values)}d", *values.values()))
+        await server.async_setValues(1, 16, 0, list(words))
+
+    async def asked():
+        words = await server.async_getValues(1, 3, WRITTEN_AT, 4 * count)
+        return struct.unpack(f">{count}d", struct.pack(f">{4 * count}H", *words))
+
+    return server.shutdown, show, asked
+
+
+async def serve(served: ServedPlant, protocol: str, port: int, period: float) -> None:
+    """Run a plant at its pace until the task is cancelled."""
+    stop, show, asked = await {"opcua": opcua, "modbus": modbus}[protocol](served, port)
+    try:
+        await show(served.published())
+        due = time.monotonic()
+        while True:
+            due = max(due + period, time.monotonic())
+            await asyncio.sleep(due - time.monotonic())
+            *command, answered = await asked()
+            served.advance(command, answered)
+            await show(served.published())
+    finally:
+        await stop()
+
+
+def machine(plant: Plant, safe: tuple[float, ...], protocol: str, port: int, period: float, log: Path | None = None):
+    """The real system at the other end, which connects at its first reset."""
+    from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, Register, SafetyLayer
+
+    served = ServedPlant(plant, safe)
+    if protocol == "opcua":
+        from asyncua.sync import Client
+
+        read, written = ({tag: f"ns=2;s={tag}" for tag in tags} for tags in (served.read, served.written))
+        link = OpcUaLink(partial(Client, f"opc.tcp://{HOST}:{port}"), read, written, timeout=0.8 * period)
+    else:
+        from pymodbus.client import ModbusTcpClient
+
+        read = {tag: Register(4 * k) for k, tag in enumerate(served.read)}
+        written = {tag: Register(WRITTEN_AT + 4 * k) for k, tag in enumerate(served.written)}
+        link = ModbusLink(ModbusTcpClient(HOST, port=port, timeout=0.8 * period, retries=0), read, written)
+    entries = {key: tags for key, tags in served.entries.items() if tags}
+    tags = {"sample": "sample", "answered": "answered"}
+    client = ConnectedPlant(link, entries, served.written[:-1], plant.actions, period=period, **tags)
+    limits = SafetyConfig(interval=plant.dt, ranges={"skipped": (-0.5, 0.5)}, log=log)
+    places = {key: Reading(keys=(key,)) for key in entries}
+    return RealSystem(SafetyLayer(client, limits, fallback=safe), plant, **places, closure=plant.closure, seed=None)
 
 
 def main(config: Config, **parts: Any) -> None:
-    """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run, ServerProcess, served_system  # here, because --help need not wait for TorchRL
+    """Train, or serve; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
+    plant, place = config.plant(), (config.protocol, config.port, config.dt / config.pace)
+    if config.serve:
+        print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
+        logging.disable(logging.CRITICAL)  # clients that go away are no errors of this process
+        asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
+    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    plant = config.plant()
-    server = contextlib.nullcontext() if config.connect else ServerProcess(plant, **config.served(), seed=config.seed)
-    with server:
-        if config.serve:
-            print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
-            while True:
-                time.sleep(1.0)
-        if config.act is not None:
-            act(config, config.act)
-            return
-        env = partial(served_system, plant, **config.served(), closure=plant.closure)
-        Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController, **parts).train()
-
-
-def act(config: Config, file: Path) -> None:
-    """Let an exported policy act for one horizon, and write what came of it."""
-    import torch
-
-    from rt_torchrl import ExplorationConfig, load_policy, served_system
-    from rt_torchrl.systems.collectors import EpisodeCollector
-    from rt_torchrl.systems.exploration import LivePolicy
-
-    torch.set_num_threads(1)
-    folder, plant = config.log_dir or Path("runs/in_service"), config.plant()
-    make_folder("log_dir", folder)
-    policy, log = load_policy(file, plant, trusted=config.trusted), folder / "safety.jsonl"
-    log.unlink(missing_ok=True)
-    actor = LivePolicy(plant, policy, ExplorationConfig(episodes=0), generator=torch.Generator())
-    actor.begin(policy, strength=0.0)
-    system = served_system(plant, **config.served(), log=log)
-    with contextlib.closing(system):
-        episode = EpisodeCollector(system, actor, plant).rollout()[0]
-    client = system.env.env
-    results = {
-        "J_a": -episode["next", "reward"].mean().item(),
-        "intervals": float(plant.n_steps),
-        "refused": float(episode["next", "refused"].sum()),
-        "skipped": float(client.skipped),
-        "late_answers": float(client.late),
-        "lost_connections": float(client.losses),
-    }
-    path = write_results(folder / "in_service.json", {"config": config, **results})
-    for name, value in results.items():
-        print(f"{name.replace('_', ' '):<24}{value:.6g}")
-    print(f"results in {path}")
+    config = dataclasses.replace(config, asynchronous=True, operation=OperationConfig(continuous=True))
+    env = partial(machine, plant, SAFE, *place)
+    Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController, **parts).train()
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ from .systems.exploration import ExplorationConfig
 from .systems.machine.connected_plant import ConnectedPlant, Link, LinkLostError, RefusedRequestError
 from .systems.machine.modbus import ModbusLink, Register
 from .systems.machine.opc_ua import OpcUaLink
-from .systems.machine.rehearsal import ServerProcess, served_system
 from .systems.preflight import Wiring, WiringError, check_real_system
 from .systems.real_system import Actuation, Reading, RealSystem
 from .systems.safety import OperatingLimits, SafetyEvent, SafetyLayer, SafetyReport
@@ -187,7 +186,6 @@ __all__ = [
     "Scenario",
     "Sensor",
     "SensorRecord",
-    "ServerProcess",
     "Signal",
     "SmoothClip",
     "Snapshot",
@@ -230,6 +228,5 @@ __all__ = [
     "rk4_step",
     "sensor_record",
     "sensors_of",
-    "served_system",
     "shipped_plants",
 ]

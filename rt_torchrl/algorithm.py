@@ -52,7 +52,7 @@ from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operator import Operation, system_of
+from rt_torchrl.systems.operation import Operation, system_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import batch_of

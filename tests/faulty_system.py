@@ -54,12 +54,12 @@ class FaultySystem(AroundSystem):
 
     def _reset(self, tensordict=None, **kwargs):
         self._count, self._since, self._offset, self._sent = 0, 0, 0.0, None
-        return self._gone_on(self.env.reset(**kwargs))
+        return self._timed(self.env.reset(**kwargs))
 
-    def _count_window(self):
+    def begin_window(self):
         self._count = 0
 
-    def _gone_on(self, found):
+    def _timed(self, found):
         found["time"] = torch.full((*self.batch_size, 1), self._since * self._interval + self._offset).double()
         self._reading = found.clone()
         return found
@@ -77,7 +77,7 @@ class FaultySystem(AroundSystem):
         found, before = self.env.step(sent)["next"].copy(), self._reading
         if "clock_jump" in begun:
             self._offset += active["clock_jump"].value
-        found = self._gone_on(found)
+        found = self._timed(found)
         state = found["state"] = found["state"].clone()
         if "frozen" in begun:
             self._held = before["state"][..., 0]

@@ -109,12 +109,9 @@ IMPLEMENTATIONS = {"rt_torchrl": of_this_library, "stable-baselines3": of_stable
 @torch.no_grad()
 def mean_return(plant, policy):
     """Mean sum of the rewards in 20 unseen episodes; the pendulum of this library steps as Gymnasium's does."""
-    env = PlantEnv(plant, batch_size=20, seed=UNSEEN_SEED)
-    present, rewards = env.reset(), 0.0
-    for _ in range(plant.n_steps):
-        stepped = env.step(present.set("action", policy(present["observation"])))
-        rewards, present = rewards + stepped["next", "reward"].mean().item(), env.step_mdp(stepped)
-    return rewards
+    env = PlantEnv(plant, seed=UNSEEN_SEED)
+    act = lambda td: td.set("action", policy(td["observation"]))  # noqa: E731
+    return sum(env.rollout(plant.n_steps, act)["next", "reward"].sum().item() for _ in range(20)) / 20
 
 
 def train(name, algorithm, implementation, seed):

@@ -3,33 +3,55 @@
 import asyncio
 import contextlib
 import socket
+import subprocess
+import sys
 import threading
 
-from rt_torchrl.systems.machine.rehearsal import SERVERS, ServedPlant, serve
+import served_turbine
+from served_turbine import HOST, ServedPlant, serve
 
 
 def free_port():
     with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
+        one.bind((HOST, 0))
         return one.getsockname()[1]
+
+
+@contextlib.asynccontextmanager
+async def in_operation(running, protocol, port, period):
+    task = asyncio.create_task(serve(running, protocol, port, period))
+    try:
+        while not task.done():
+            with contextlib.suppress(OSError):
+                (await asyncio.open_connection(HOST, port))[1].close()
+                break
+            await asyncio.sleep(0.02)
+        yield running, port
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
 
 @contextlib.contextmanager
 def served(plant, protocol, *, safe, period, seed=0):
     """The plant in operation; gives it and the port that its server listens on."""
-    port, ended, started = free_port(), threading.Event(), threading.Event()
     running = ServedPlant(plant, safe, seed=seed)
-    server = SERVERS[protocol](plant, port)
-    serving = serve(running, server, period, ended=ended.is_set, begun=started.set)
-    work = threading.Thread(target=lambda: asyncio.run(serving), daemon=True)
-    work.start()
-    assert started.wait(30.0)
+    with in_a_thread(in_operation(running, protocol, free_port(), period)) as (found, _):
+        yield found
+
+
+@contextlib.contextmanager
+def served_turbine_alone(**options):
+    """The turbine in a process of its own, as the recipe serves it with these options; gives its port."""
+    options = {"port": free_port()} | options
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    process = subprocess.Popen([sys.executable, served_turbine.__file__, "--serve", *words], stdout=subprocess.DEVNULL)
     try:
-        yield running, port
+        yield options["port"]
     finally:
-        ended.set()
-        work.join(30.0)
-        assert not work.is_alive()
+        process.terminate()
+        process.wait(10.0)
 
 
 @contextlib.contextmanager
@@ -38,8 +60,8 @@ def in_a_thread(server):
     begun, found = threading.Event(), {}
 
     async def run():
-        found.update(loop=asyncio.get_running_loop(), ended=asyncio.Event())
-        async with server as found["value"]:
+        async with server as value:
+            found.update(value=value, loop=asyncio.get_running_loop(), ended=asyncio.Event())
             begun.set()
             await found["ended"].wait()
 

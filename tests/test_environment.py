@@ -1,9 +1,8 @@
-"""The real system in simulation: batches, partial resets, seeds, actuators and divergence."""
+"""The real system in simulation: its step, its clock, its sensors, wear and divergence."""
 
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from tensordict import TensorDict
 
 from rt_torchrl.plants.sampling import rk4_step
 from rt_torchrl.systems.environment import PlantEnv
@@ -23,12 +22,12 @@ def uniform_actions(env, seed):
 
 def test_step_is_one_runge_kutta_step_of_the_true_system():
     plant = LinearQuadratic()
-    env = PlantEnv(plant, batch_size=3, seed=1)
+    env = PlantEnv(plant, seed=1)
     found = env.reset()
     action = uniform_actions(env, 0)
     done = act(env, found, action)
     matrix = sum(torch.tensor(m, dtype=torch.float64) for m in (plant.A, plant.true_closure))
-    force = torch.cat([torch.zeros(3, 1, dtype=torch.float64), action + found["exogenous"]], -1)
+    force = torch.cat([torch.zeros(1, 1, dtype=torch.float64), action + found["exogenous"]], -1)
     expected = rk4_step(lambda t, s: s @ matrix.T + force, torch.tensor(0.0), found["state"], plant.dt)
     # The same sums in another order.
     torch.testing.assert_close(done["next", "state"], expected, rtol=1e-13, atol=1e-14)
@@ -50,52 +49,15 @@ class Clock(LinearQuadratic):
 
 def test_clock_is_that_of_the_twin_to_the_last_bit():
     """t_k = k dt in double precision, in the observation, the cost and the field: s_n − s_0 = ½T²."""
-    env = PlantEnv(Clock(dt=0.1, horizon=5.0), batch_size=2)
+    env = PlantEnv(Clock(dt=0.1, horizon=5.0))
     episode = env.rollout(50)
     t = 0.1 * torch.arange(51, dtype=torch.float64)
-    assert torch.equal(episode["observation"], t[:-1, None].expand(2, 50, 2))
-    assert torch.equal(episode["next", "observation"], t[1:, None].expand(2, 50, 2))
-    assert torch.equal(episode["next", "reward"][..., 0], -t[:-1].expand(2, 50))
+    assert torch.equal(episode["observation"], t[:-1, None].expand(1, 50, 2))
+    assert torch.equal(episode["next", "observation"], t[1:, None].expand(1, 50, 2))
+    assert torch.equal(episode["next", "reward"][..., 0], -t[:-1].expand(1, 50))
     moved = episode["next", "state"][:, -1] - episode["state"][:, 0]
     # Exact quadrature of a linear function: rounding of 50 sums.
-    torch.testing.assert_close(moved, torch.full((2, 2), 12.5, dtype=torch.float64), rtol=1e-13, atol=0)
-
-
-def test_rows_of_a_batch_are_independent_systems():
-    plant = LinearQuadratic()
-    env, single = PlantEnv(plant, batch_size=3, seed=2), PlantEnv(plant, batch_size=1)
-    found = env.reset()
-    action = uniform_actions(env, 1)
-    together = act(env, found, action)
-    for row in range(3):
-        single.reset()
-        single._state, single._exogenous = found["state"][row : row + 1].clone(), env._exogenous[row : row + 1]
-        alone = act(single, TensorDict({}, batch_size=[1]), action[row : row + 1])
-        # Rounding of another vector length.
-        for key in ("state", "reward"):
-            torch.testing.assert_close(alone["next", key][0], together["next", key][row], rtol=1e-13, atol=1e-14)
-
-
-def test_partial_reset_restarts_the_marked_rows_only():
-    plant = LinearQuadratic(horizon=1.0)
-    env = PlantEnv(plant, batch_size=3, seed=5)
-    found = env.reset()
-    for k in range(4):
-        found = act(env, found, uniform_actions(env, k))["next"].exclude("reward")
-    mask = torch.tensor([[False], [True], [False]])
-    again = env.reset(found.clone().set("_reset", mask))
-    assert torch.equal(again["state"][[0, 2]], found["state"][[0, 2]])
-    assert torch.equal(again["exogenous"][[0, 2]], found["exogenous"][[0, 2]])
-    assert not torch.equal(again["state"][1], found["state"][1])
-    assert not again["done"].any()
-    ends = []
-    for k in range(10):
-        stepped = act(env, again, uniform_actions(env, 10 + k))["next"]
-        again = stepped.exclude("reward")
-        ends.append(stepped["truncated"][:, 0].tolist())
-    # Rows 0 and 2 had six steps left, row 1 has ten.
-    assert [row[0] for row in ends].index(True) == [row[2] for row in ends].index(True) == 5
-    assert [row[1] for row in ends].index(True) == 9
+    torch.testing.assert_close(moved, torch.full((1, 2), 12.5, dtype=torch.float64), rtol=1e-13, atol=0)
 
 
 class Explosive(LinearClosure):
@@ -106,7 +68,7 @@ class Explosive(LinearClosure):
 def test_divergence_is_raised_with_time_state_and_command():
     plant = LinearQuadratic()
     plant.closure = Explosive(plant.true_closure)
-    env = PlantEnv(plant, batch_size=2)
+    env = PlantEnv(plant)
     found = env.reset()
     message = (
         r"plant 'linear_quadratic' diverged at t = \d\S* s: state \[\[.*\], command \[\[.*\], "
@@ -119,16 +81,15 @@ def test_divergence_is_raised_with_time_state_and_command():
 
 def test_sensors_err_by_a_share_of_what_they_read():
     plant = LinearQuadratic(horizon=30.0, noise=0.0)
-    clean, noisy = (PlantEnv(plant, batch_size=40, seed=1, noise=noise) for noise in (0.0, 0.02))
-    true, read = (env.rollout(300, break_when_any_done=False) for env in (clean, noisy))
-    # The same start; the actions of a rollout without a policy are random, so only the first step compares.
-    start, seen = true["state"][:, 0], read["state"][:, 0]
-    ratio = (seen / start - 1.0) / 0.02
-    # Of 80 standard normals: mean within 3.5/√80, deviation within 3.5/√160.
-    assert ratio.mean().abs() < 0.4 and (ratio.std() - 1.0).abs() < 0.28
+    clean, noisy = (PlantEnv(plant, seed=1, noise=noise) for noise in (0.0, 0.02))
+    policy = lambda td: td.set("action", torch.zeros(1, 1).double())  # noqa: E731
+    true, read = (env.rollout(300, policy)[0] for env in (clean, noisy))
+    ratio = (read["state"] / true["state"] - 1.0) / 0.02
+    # Of 600 standard normals: mean within 4/√600, deviation within 4/√1200.
+    assert ratio.mean().abs() < 0.16 and (ratio.std() - 1.0).abs() < 0.12
     # On this plant the observation is the state, and what is read at the end of a step is what the next one sees.
     assert torch.equal(read["observation"], read["state"])
-    assert torch.equal(read["next", "state"][:, :-1], read["state"][:, 1:])
+    assert torch.equal(read["next", "state"][:-1], read["state"][1:])
 
 
 def test_the_real_system_wears_from_episode_to_episode():
@@ -150,7 +111,6 @@ def test_the_real_system_wears_from_episode_to_episode():
     assert env.closure is worn[1]
 
 
-@pytest.mark.parametrize(("options", "message"), [({"batch_size": 0}, "batch_size=0"), ({"noise": 1.5}, "noise=1.5 ")])
-def test_arguments_out_of_range_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        PlantEnv(LinearQuadratic(), **options)
+def test_noise_out_of_range_is_refused():
+    with pytest.raises(ValueError, match="noise=1.5 "):
+        PlantEnv(LinearQuadratic(), noise=1.5)

@@ -47,9 +47,9 @@ def whole(tmp_path_factory, server):
     """Trainings that nothing disturbs, by plant: folder and episodes of each, and how long it takes [s]."""
 
     @functools.cache
-    def run(plant, **options):
+    def run(plant):
         folder, begin = tmp_path_factory.mktemp("whole"), time.perf_counter()
-        started(server, folder, plant, **options).join()
+        started(server, folder, plant).join()
         return folder, deterministic(folder), time.perf_counter() - begin
 
     return run
@@ -76,28 +76,26 @@ def require_resumed(server, folder, undisturbed, plant=None, **options):
     assert same(*(load_tensors(path / "weights.pt") for path in (folder, undisturbed[0])))
 
 
-STOPS = [("kill", None, False, 40), ("terminate", None, False, 20)]
-STOPS += [("kill", plant, asynchronous, 2) for plant in SHIPPED for asynchronous in (False, True)]
+STOPS = [("kill", None, 40), ("terminate", None, 20)]
+STOPS += [("kill", plant, 2) for plant in SHIPPED]
 
 
 @pytest.mark.parametrize(
-    ("stop", "plant", "asynchronous", "number"),
+    ("stop", "plant", "number"),
     [
         pytest.param(*stop, number, marks=pytest.mark.faults if number or stop[1] else pytest.mark.slow)
         for *stop, count in STOPS
         for number in range(count)
     ],
 )
-def test_a_training_that_is_stopped_at_any_moment_goes_on_to_the_bit(
-    server, tmp_path, whole, stop, plant, asynchronous, number
-):
+def test_a_training_that_is_stopped_at_any_moment_goes_on_to_the_bit(server, tmp_path, whole, stop, plant, number):
     """It loses at most the episode under way."""
-    undisturbed = whole(plant, asynchronous=asynchronous)
-    process = started(server, tmp_path, plant, asynchronous=asynchronous)
+    undisturbed = whole(plant)
+    process = started(server, tmp_path, plant)
     time.sleep(random.Random(f"{stop} {number}").uniform(0.05, 1.0) * undisturbed[2])
     getattr(process, stop)()
     process.join()
-    require_resumed(server, tmp_path, undisturbed, plant, asynchronous=asynchronous)
+    require_resumed(server, tmp_path, undisturbed, plant)
 
 
 @pytest.mark.faults
@@ -106,7 +104,7 @@ def test_a_kill_inside_a_write_loses_nothing(server, tmp_path, whole, number):
     process = started(server, tmp_path, kill_at=number % 8)
     process.join()
     assert process.exitcode in (-signal.SIGKILL, 0)
-    require_resumed(server, tmp_path, whole(None, asynchronous=False))
+    require_resumed(server, tmp_path, whole(None))
 
 
 def test_sigterm_ends_a_training_with_its_results(tmp_path, monkeypatch):
@@ -215,7 +213,7 @@ def test_after_a_fall_back_the_training_is_the_same_to_the_bit(tmp_path, kept):
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 def test_a_file_system_that_is_full_leaves_what_was_done(server, tmp_path, whole, share):
     """It has a share of the room that the run needs; then there is room, and the run goes on."""
-    undisturbed = whole(None, asynchronous=False)
+    undisturbed = whole(None)
     needs = sum(file.stat().st_size for file in undisturbed[0].rglob("*") if file.is_file()) // 1024
     mount = ["mount", "-t", "tmpfs", "-o"]
     if subprocess.run(

@@ -17,9 +17,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import RefereeConfig
-from rt_torchrl.systems.config import OperationConfig, SafetyConfig
+from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operation.operator import Crew, SimulatedOperation
 from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.systems.sound_part import GREATEST
@@ -174,16 +173,12 @@ PLANTS = {
 @pytest.mark.faults
 @pytest.mark.parametrize(("injection", "kind", "lost"), SENSORS + SYSTEMS, ids=lambda value: getattr(value, "kind", ""))
 @pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("asynchronous", [False, True], ids=["synchronous", "asynchronous"])
-def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost, asynchronous):
+def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost):
     plant, generator = PLANTS[name](), torch.Generator().manual_seed(0)
-    layer = system = guarded(injection, plant=plant)
+    layer = guarded(injection, plant=plant)
     policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = DigitalTwin(plant, plant.make_closure(generator))
-    if asynchronous:  # learning takes no time, so that the second window is the second episode
-        crew = Crew(lambda: None, plant, policies, SMALL.exploration, OperationConfig(), seed=1)
-        system = SimulatedOperation(crew.operator(system), learning=0)
-    found = ReinforcementTwinning(system, twin, **policies, config=SMALL, generator=generator)
+    found = ReinforcementTwinning(layer, twin, **policies, config=SMALL, generator=generator)
     reports = [found.episode() for _ in range(3)]
     kinds = [{key for key in report.keys() if key.startswith("faults/")} for report in reports]  # noqa: SIM118
     last = injection.first if injection.last is None else injection.last

@@ -13,15 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from relay import Relay
-from served_plants import free_port
+from served_plants import served_turbine_alone
+from served_turbine import SAFE, Config, machine
 from tensordict import TensorDict
 from test_export_recipe import recipe
-from test_operation import QUIET
 
-from rt_torchrl import OperationConfig, PlantEnv, Run, ServerProcess, served_system
+from rt_torchrl import ExplorationConfig, OperationConfig, PlantEnv, Run
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.systems.operation.operator import Crew
-from rt_torchrl.systems.operation.process import ProcessOperation
+from rt_torchrl.systems.operation import Operation, Operator
 
 pytestmark = pytest.mark.machine
 SECONDS = float(os.environ.get("SECONDS_OF_A_MACHINE_TEST", "120"))
@@ -52,13 +51,13 @@ def lose(relay, ended, lost):
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="memory and file handles are read from /proc")
 def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path):
     pytest.importorskip("pymodbus")
-    module, port, log = recipe("served_turbine"), free_port(), tmp_path / "safety.jsonl"
-    config = module.Config().defaults()
-    config = dataclasses.replace(config, pace=PACE, horizon=60.0, port=port, threads=1, log_dir=tmp_path / "run")
-    plant, ended, lost, used = config.plant(), threading.Event(), [], []
-    with ServerProcess(plant, **config.served()), contextlib.closing(Relay(port)) as relay:
-        served = config.served() | {"port": relay.port}
-        run = Run(config, plant, env=partial(served_system, plant, **served, log=log), first=JonkmanController)
+    log, config = tmp_path / "safety.jsonl", Config().defaults()
+    operation = {"asynchronous": True, "operation": OperationConfig(continuous=True)}
+    config = dataclasses.replace(config, horizon=60.0, threads=1, log_dir=tmp_path / "run", **operation)
+    plant, period, ended, lost, used = config.plant(), config.dt / PACE, threading.Event(), [], []
+    with served_turbine_alone(pace=PACE, horizon=60.0) as port, contextlib.closing(Relay(port)) as relay:
+        env = partial(machine, plant, SAFE, "modbus", relay.port, period, log=log)
+        run = Run(config, plant, env=env, first=JonkmanController)
         algorithm, until = run.algorithm, float("inf")
         losing = threading.Thread(target=lose, args=(relay, ended, lost), daemon=True)
         try:
@@ -103,9 +102,9 @@ def test_the_period_is_kept_beside_learning_as_without(tmp_path):
     plant, period = config.plant(), 0.02
     run = Run(config, plant, first=JonkmanController)
     episode, policy = run.algorithm(TensorDict({"number": 0})), run.algorithm.policies["model_free"]
-    options = OperationConfig(clock="wall", speed=plant.dt / period, continuous=True)
-    crew = Crew(partial(PlantEnv, plant, seed=1), plant, {"model_free": policy}, QUIET, options, seed=0)
-    operation = ProcessOperation(crew, PlantEnv(plant, seed=1))
+    make_env, options = partial(PlantEnv, plant, seed=1), OperationConfig(speed=plant.dt / period)
+    acting = Operator(make_env, plant, {"model_free": policy}, ExplorationConfig(episodes=0), options, seed=0)
+    operation = Operation(acting, make_env())
 
     def learn():
         for name, step in run.algorithm.module.items():

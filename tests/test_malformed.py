@@ -301,7 +301,7 @@ CONSTRUCTORS = [
     (FlappingWing, {"dt": 0.001, "horizon": 0.1}),
     (CryogenicTank, {"dt": 30.0, "horizon": 3000.0}),
     (Pendulum, {"dt": 0.05, "horizon": 2.0}),
-    (lambda **o: PlantEnv(LinearQuadratic(horizon=2.0), **o), {"batch_size": 1, "noise": 0.1, "seed": 0}),
+    (lambda **o: PlantEnv(LinearQuadratic(horizon=2.0), **o), {"noise": 0.1, "seed": 0}),
     (lambda **o: SafetyLayer(PlantEnv(LinearQuadratic()), SafetyConfig(interval=0.1), **o), {"fallback": (0.0,)}),
     (Reading, {"scale": 1.0, "offset": 0.0}),
     (Actuation, {"scale": 1.0, "offset": 0.0}),

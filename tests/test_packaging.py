@@ -156,7 +156,7 @@ ROOMS_OF = {
     "paper.py": {"optimisers", "runs", "steps", "systems"},
     "paper_figures.py": {"figures", "runs", "steps"},
     "record_log.py": {"fit", "runs"},
-    "served_turbine.py": {"runs", "systems"},
+    "served_turbine.py": {"plants"},
     "study.py": {"atomic_file", "evaluation", "figures", "interruption", "runs", "steps"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""

@@ -71,10 +71,10 @@ def test_an_extension_has_the_scheme_of_its_plant_unless_hidden_states_have_thei
     assert [plant.own_scheme for plant in found] == [False, True, True, True]
 
 
-def fly(plant, *, batch=1, seed=0):
+def fly(plant, *, seed=0):
     """A real episode under the plant's initial policy, with the policy."""
     policy = plant.make_policy(seeded(5))
-    env = PlantEnv(plant, batch_size=batch, seed=seed)
+    env = PlantEnv(plant, seed=seed)
     with torch.no_grad():
         episode = env.rollout(
             plant.n_steps + 10, TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
@@ -132,7 +132,7 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
 
 
 def test_reward_is_minus_the_running_cost(plant):
-    episode, _ = fly(plant, batch=3)
+    episode, _ = fly(plant)
     t = plant.dt * torch.arange(plant.n_steps, dtype=torch.float64)
     cost = plant.running_cost(t, episode["state"], episode["next", "applied"], episode["exogenous"])
     torch.testing.assert_close(episode["next", "reward"][..., 0], -cost, rtol=1e-12, atol=1e-15)  # rounding
@@ -140,13 +140,13 @@ def test_reward_is_minus_the_running_cost(plant):
 
 
 def test_environment_fulfils_its_specs(plant):
-    check_env_specs(PlantEnv(plant, batch_size=2, seed=3), seed=3)
+    check_env_specs(PlantEnv(plant, seed=3), seed=3)
 
 
 def test_episode_is_truncated_at_the_horizon_and_never_terminated(plant):
-    episode, _ = fly(plant, batch=2)
-    assert episode.shape == (2, plant.n_steps)
-    last = torch.zeros(2, plant.n_steps, 1, dtype=torch.bool)
+    episode, _ = fly(plant)
+    assert episode.shape == (1, plant.n_steps)
+    last = torch.zeros(1, plant.n_steps, 1, dtype=torch.bool)
     last[:, -1] = True
     assert torch.equal(episode["next", "truncated"], last) and torch.equal(episode["next", "done"], last)
     assert not episode["next", "terminated"].any()

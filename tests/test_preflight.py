@@ -263,7 +263,7 @@ class Sparse(PlantEnv):
 
     def _step(self, tensordict):
         found = super()._step(tensordict)
-        if self._step_count.item() % 5 == 0:
+        if self._step_count % 5 == 0:
             found["state"] = torch.full_like(found["state"], math.nan)
         return found
 

@@ -179,7 +179,7 @@ def test_the_help_has_a_screenful_of_options_and_help_all_has_the_rest(plant, ca
     short, full = (set(names) - {"help-all"} for names in listed)
     parts = {field.name for field in dataclasses.fields(config) if dataclasses.is_dataclass(field.type)}
     assert {name.replace("-", "_") for name in short} == {field.name for field in dataclasses.fields(config)} - parts
-    assert short < full and {"twinning.learner.discount", "operation.clock"} < full
+    assert short < full and {"twinning.learner.discount", "operation.speed"} < full
 
 
 # Values that an option of their type cannot have are refused when a configuration is made in code.

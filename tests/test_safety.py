@@ -161,8 +161,8 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
     for _ in range(2):
         # The watchdog is tripped at the end of the episode; the next one does not inherit that.
         assert applied(fly(env, [float("nan")] + [3.0] * 19))[:12] == [-1.0] * 10 + [2.0] * 2
+        assert env.report.counts == {"asked": 1, "fallback": 10, "range": 10, "not finite": 1}
     found = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [report.counts for report in env.reports] == [{"asked": 1, "fallback": 10, "range": 10, "not finite": 1}] * 2
     assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in range(2) for k in range(20)]
     assert found[0]["asked"] == [None] and found[0]["applied"] == [-1.0] and "asked" in found[0]["reasons"]
 
@@ -181,7 +181,7 @@ def test_reinforcement_twinning_learns_from_what_was_applied():
     env = layer(PlantEnv(plant, seed=0), rates=(1.0,))
     found = twinning(plant, env=env)
     report = found.episode()
-    assert report["J_p"].isfinite() and env.report.counts["rate"] > 0 and len(env.reports) == 1
+    assert report["J_p"].isfinite() and env.report.counts["rate"] > 0
     record = found.short_term[-1]
     assert record.actions.diff(dim=0).abs().max() <= 0.1 + 1e-14
     held = {event.step: event.applied for event in env.report.events}
@@ -235,8 +235,6 @@ def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_o
 
 
 def test_what_cannot_be_guarded_is_refused():
-    with pytest.raises(ValueError, match=r"batch_size=\(2,\)"):
-        layer(PlantEnv(LinearQuadratic(), batch_size=2))
     for interval in (0.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=f"interval={interval}"):
             SafetyConfig(interval=interval)

@@ -3,39 +3,28 @@
 import dataclasses
 import json
 import math
-import socket
-import sys
 import threading
 import time
 from collections import Counter
 
 import pytest
+import served_turbine
 import torch
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from relay import Relay
-from served_plants import free_port, served
+from served_plants import free_port, served, served_turbine_alone
+from served_turbine import ServedPlant, machine
 from tensordict import TensorDict
-from test_export_recipe import leave_run, recipe
 
-from rt_torchrl.export.program import export_program
-from rt_torchrl.runs.run_config import physics_of
 from rt_torchrl.systems.machine.connected_plant import ConnectedPlant, LinkLostError
 from rt_torchrl.systems.machine.modbus import ModbusLink, Register
-from rt_torchrl.systems.machine.rehearsal import (
-    ServedPlant,
-    ServerProcess,
-    link_to,
-    served_system,
-    tags_of,
-    written_tags,
-)
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.rollout import Rollout
 
 PLANT = LinearQuadratic(horizon=2.0)
-ENTRIES = tags_of(PLANT)
-COMMANDS = ENTRIES.pop("commands")
+TAGS = ServedPlant(PLANT, (0.0,))
+ENTRIES, COMMANDS = TAGS.entries, TAGS.written[:-1]
 PROTOCOLS = [pytest.param("opcua", marks=pytest.mark.slow), "modbus"]  # a server of OPC UA starts in seconds
 
 
@@ -45,28 +34,21 @@ def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples(
     states = []
     for k, command in enumerate(asked.tolist()):
         states.append([plant.published()[f"state.{state.name}"] for state in PLANT.states])
-        plant.advance(float(k), [command])
+        plant.advance([command], float(k + 1))
     generator = torch.Generator().manual_seed(3)
     start, inputs = PLANT.draw_initial_state(1, generator), PLANT.draw_exogenous(1, generator)
     expected = Rollout(PLANT, PLANT.closure)(start, inputs, asked[None, :, None])
     torch.testing.assert_close(torch.tensor(states).double(), expected.states[0, :-1].detach())
-    assert plant.missed == 0 and not plant.safe
+    assert plant.sample == PLANT.n_steps + 1 and not torch.equal(plant._inputs, inputs)
 
 
-@pytest.mark.parametrize("wrong", [(1, 1.0), (2, math.nan), (2, math.inf), (2, 2.001)])
+@pytest.mark.parametrize("wrong", [(2, 1.0), (3, math.nan), (3, math.inf), (3, 2.001)])
 def test_a_command_that_is_missing_or_wrong_brings_the_safe_action_in_its_interval(wrong):
     plant, applied = ServedPlant(PLANT, (-0.5,)), []
-    for answered, command in [(0, 1.0), (1, 1.5), wrong, wrong, wrong, (5, 1.0)]:
-        plant.advance(float(answered), [command])
-        applied.append((plant.published()["applied.force"], plant.published()["safe"]))
-    assert applied == [(1.0, 0.0), (1.5, 0.0), (-0.5, 1.0), (-0.5, 1.0), (-0.5, 1.0), (1.0, 0.0)]
-    assert plant.missed == 3
-
-
-@pytest.mark.parametrize("safe", [(), (0.0, 0.0), (math.nan,), (2.5,)])
-def test_a_safe_action_that_does_not_fit_is_refused(safe):
-    with pytest.raises(ValueError, match="safe=.* must be one number within the range of each action"):
-        ServedPlant(PLANT, safe)
+    for answered, command in [(1, 1.0), (2, 1.5), wrong, wrong, wrong, (6, 1.0)]:
+        plant.advance([command], float(answered))
+        applied.append(plant.published()["applied.force"])
+    assert applied == [1.0, 1.5, -0.5, -0.5, -0.5, 1.0]
 
 
 class Time:
@@ -94,8 +76,8 @@ class Line:
         self.requests[request] += 1
         if (request, self.requests[request]) in self.fails:
             raise self.fails[request, self.requests[request]]
-        while (self.plant.sample + 1) * self.period <= self.time.now + 1e-12:
-            self.plant.advance(self.answer["answered"], [self.answer["command.force"]])
+        while self.plant.sample * self.period <= self.time.now + 1e-12:
+            self.plant.advance([self.answer["command.force"]], self.answer["answered"])
         if any(begin <= self.time.now < end for begin, end in self.down):
             raise LinkLostError("down")
 
@@ -125,7 +107,7 @@ def test_a_client_answers_every_sample_of_the_plant():
     line = Line(Time(), 0.1)
     env = connected(line)
     found = env.rollout(50, lambda td: td.set("action", torch.ones(1).double()))
-    assert line.plant.missed == 0 and env.losses == env.stale == env.skipped == 0
+    assert env.losses == env.stale == env.skipped == 0
     assert (found["next", "applied"] == 1.0).all()
     assert line.time.now == pytest.approx(5.0, rel=0.02)
 
@@ -175,7 +157,7 @@ def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
     """States, inputs and applied actions as they came over the line are a step of the plant, to the last digit."""
     pytest.importorskip({"opcua": "asyncua", "modbus": "pymodbus"}[protocol])
     with served(PLANT, protocol, safe=(0.0,), period=0.05) as (running, port):
-        system = served_system(PLANT, safe=(0.0,), protocol=protocol, port=port, period=0.05)
+        system = machine(PLANT, (0.0,), protocol, port, 0.05)
         row, rows = system.reset(), []
         for k in range(12):
             row = system.step(row.set("action", torch.tensor([[0.1 * k - 0.5]]).double()))
@@ -222,41 +204,6 @@ def test_a_modbus_client_that_would_hold_the_control_loop_is_refused(options, me
         ModbusLink(client, {"a": Register(0)}, {"b": Register(4)})
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_link_to_nobody_says_that_the_plant_does_not_answer(protocol):
-    link = link_to(protocol, PLANT, free_port(), period=1.0)
-    for work in (link.connect, link.read, lambda: link.write(dict.fromkeys(written_tags(PLANT), 0.0))):
-        with pytest.raises(LinkLostError):
-            work()
-    link.close()
-
-
-SIDES = {
-    "server": lambda protocol: ServerProcess(PLANT, (0.0,), protocol=protocol, port=5020, period=0.1),
-    "client": lambda protocol: served_system(PLANT, safe=(0.0,), protocol=protocol, period=0.1),
-}
-
-
-@pytest.mark.parametrize("side", SIDES)
-def test_a_protocol_that_nobody_speaks_or_whose_package_is_not_there_is_refused(side, monkeypatch):
-    with pytest.raises(ValueError, match="protocol='bacnet' does not exist; choose opcua or modbus"):
-        SIDES[side]("bacnet")
-    for protocol, package in (("opcua", "asyncua.sync"), ("modbus", "pymodbus.simulator")):
-        monkeypatch.setitem(sys.modules, package, None)
-        with pytest.raises(ValueError, match=rf"'{protocol}' needs a package \(.*{package}.*install the extra"):
-            SIDES[side](protocol)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["opcua", "modbus"])
-def test_a_port_in_use_is_said_without_a_traceback(protocol, capfd):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port={port}"):
-            ServerProcess(LinearQuadratic(), (0.0,), protocol=protocol, port=port, period=0.1).__enter__()
-    assert "Traceback" not in capfd.readouterr().err
-
-
 # Lost connections between a client and a served plant: cut off, and silent as with a cable that was pulled.
 
 
@@ -272,8 +219,8 @@ class Course:
         self.applied, self.times = [], []
         advance = running.advance
 
-        def watched(answered, command):
-            advance(answered, command)
+        def watched(command, answered):
+            advance(command, answered)
             self.applied.append(running.published()["applied.force"])
             self.times.append(time.monotonic())
 
@@ -301,7 +248,7 @@ def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol, 
     generator = torch.Generator().manual_seed(0)
     with served(ENDLESS, protocol, safe=(SAFE,), period=PERIOD) as (running, port):
         relay, course, moments = Relay(port), Course(running), []
-        system = served_system(ENDLESS, safe=(SAFE,), protocol=protocol, port=relay.port, period=PERIOD)
+        system = machine(ENDLESS, (SAFE,), protocol, relay.port, PERIOD)
         row = acting(system, system.reset(), 10)
         for k in range(losses):
             seconds = PERIOD * (2.0 + 4.0 * torch.rand((), generator=generator).item())
@@ -309,10 +256,10 @@ def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol, 
             (relay.cut if k % 2 else relay.stall)(seconds)
             row = acting(system, row, 8)
             for _ in range(100):  # until the plant follows again
-                if not running.safe and not row["refused"].any():
+                if course.applied[-1] == ASKED and not row["refused"].any():
                     break
                 row = acting(system, row, 1)
-            assert not running.safe, f"the run does not go on after loss {k}"
+            assert course.applied[-1] == ASKED, f"the run does not go on after loss {k}"
             row = acting(system, row, 2)
         env = system.env.env
         assert env.losses + env.late >= losses  # a short silence is a late answer or two, and no lost connection
@@ -375,7 +322,7 @@ def test_a_loss_right_after_a_new_connection_is_mended_too():
     env.close()
 
 
-# The recipes around the served turbine, in small: they end, and their results say what happened.
+# The recipe of the served turbine, in small.
 
 
 PACE = 5.0  # a period of 0.1 s, for a machine that does other things too
@@ -383,44 +330,20 @@ PACE = 5.0  # a period of 0.1 s, for a machine that does other things too
 
 @pytest.mark.nightly
 def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
-    module = recipe("served_turbine")
-    usual = module.Config().defaults()
-    config = dataclasses.replace(
-        usual, quick=True, horizon=60.0, pace=PACE, port=free_port(), threads=1, log_dir=tmp_path, figures=False
-    )
-    module.main(dataclasses.replace(config))
+    config = served_turbine.Config().defaults()
+    options = {"quick": True, "horizon": 60.0, "pace": PACE, "threads": 1, "log_dir": tmp_path, "figures": False}
+    config = dataclasses.replace(config, **options)
+    with served_turbine_alone(pace=PACE, horizon=config.horizon) as port:
+        served_turbine.main(dataclasses.replace(config, port=port))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     versions = [record["version"] for record in metrics["episodes"]]
     assert len(versions) == 3 and versions == sorted(versions) and versions[-1] >= 1.0
     assert all(0.0 < record["late_median"] < 100.0 for record in metrics["episodes"])
 
 
-@pytest.mark.nightly
-def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
-    config, parts = leave_run(tmp_path / "run", "wind_turbine")
-    export_program(parts["model_based"], tmp_path / "law.pt2", physics_of(config))
-    module = recipe("served_turbine")
-    options = {"act": tmp_path / "law.pt2", "trusted": True, "observe": config.observe, "horizon": 20.0, "pace": PACE}
-    module.main(module.Config(**options, port=free_port(), log_dir=tmp_path / "service"))
-    results = json.loads((tmp_path / "service" / "in_service.json").read_text())
-    assert results["intervals"] == 40.0 and results["lost_connections"] == 0.0 and results["J_a"] > 0.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"pace": 0.0}, "pace="),
-        ({"port": 0}, "port="),
-        ({"real": "rosco"}, "real='rosco' is another real system"),
-        ({"unknown": ("pitch",)}, "unknown=.*'pitch'.* is another real system"),
-        ({"model_error": True}, "model_error=True is another real system"),
-        ({"serve": True, "connect": True}, "serve=True runs the server alone"),
-        ({"serve": True, "act": "law.onnx"}, "serve=True runs the server alone"),
-    ],
-)
-def test_impossible_options_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        recipe("served_turbine").Config(**options)
+def test_another_real_system_than_the_served_one_is_refused():
+    with pytest.raises(ValueError, match="real, unknown and model_error are other real systems"):
+        served_turbine.Config(unknown=("pitch",))
 
 
 # What the page "Connect your machine" prints: its example makes a real system that has not connected yet.

@@ -30,8 +30,7 @@ from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.start import Start
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operation.operator import FIRST, Crew, Operation, SimulatedOperation
-from rt_torchrl.systems.operation.process import ProcessOperation
+from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -108,8 +107,6 @@ def judged_on(
     return unseen
 
 
-LEARNING = 0.5
-"""Time that learning from one window takes on the simulated clock, as a share of a window."""
 NOISE = 2**20
 """Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
 
@@ -119,7 +116,7 @@ def learner_threads(config: RunConfig) -> int:
 
     Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
     """
-    if config.threads or not (config.asynchronous and config.operation.clock == "wall"):
+    if config.threads or not config.asynchronous:
         return config.threads
     return min(torch.get_num_threads(), max(1, (os.cpu_count() or 1) - 1))
 
@@ -144,36 +141,26 @@ def operation_of(
         first: what the training begins with, whose teacher may act, too.
 
     Raises:
-        ValueError: if episodes of the plant may end early; on the wall clock, if there is no function that makes the
-            real system, the device is not the CPU, or what acts cannot be sent to another process.
+        ValueError: if episodes of the plant may end early, there is no function that makes the real system, the device
+            is not the CPU, or :class:`Operation` raises it.
     """
     if plant.end_cost is not None:
         raise ValueError(
             f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
             "--asynchronous."
         )
-    options = config.operation
+    if make_env is None:
+        raise ValueError(
+            "asynchronous needs the real system in a process of its own; give Run(..., env=) a function that makes it."
+        )
+    if config.device != "cpu":
+        raise ValueError(f"asynchronous acts on the CPU alone, and device={config.device!r}; give --device cpu.")
     acting: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
     if first is not None and first.teacher is not None:
         acting[FIRST] = first.teacher
-    crew = Crew(
-        make_env or (lambda: env),
-        plant,
-        acting,
-        config.twinning.exploration,
-        options,
-        seed=episode_seed(config.seed, NOISE),
-    )
-    if options.clock == "simulated":
-        learning = round(LEARNING * plant.n_steps)
-        return SimulatedOperation(crew.operator(env), learning=learning)
-    if make_env is None:
-        raise ValueError(
-            "clock='wall' needs the real system in a process of its own; give Run(..., env=) a function that makes it."
-        )
-    if config.device != "cpu":
-        raise ValueError(f"clock='wall' acts on the CPU alone, and device={config.device!r}; give --device cpu.")
-    return ProcessOperation(crew, env)
+    seed = episode_seed(config.seed, NOISE)
+    operator = Operator(make_env, plant, acting, config.twinning.exploration, config.operation, seed=seed)
+    return Operation(operator, env)
 
 
 def end_operation(algorithm: ReinforcementTwinning) -> None:

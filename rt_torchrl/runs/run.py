@@ -73,8 +73,8 @@ class Run:
     Args:
         config: options of the run.
         plant: the real system in simulation, and the twin's physics.
-        env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run on
-            the wall clock needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
+        env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run
+            needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
             on the twin if that closure is not known. After the training the real system flies only the
             ``config.real_unseen`` episodes of each controller that are asked for.
         believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real

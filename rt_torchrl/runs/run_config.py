@@ -153,13 +153,8 @@ class RunConfig:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
-        if not self.asynchronous and self.operation != self.usual_operation():
+        if not self.asynchronous and self.operation != OperationConfig():
             raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
-
-    @staticmethod
-    def usual_operation() -> OperationConfig:
-        """The default of ``operation``; override this method where a recipe has another one."""
-        return OperationConfig()
 
     def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
         """The policy that the options ask for, with random initial weights.

@@ -18,7 +18,7 @@ from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import Step, findings, merged, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operator import FIRST, Operation, Order
+from rt_torchrl.systems.operation import FIRST, Operation, Order
 from rt_torchrl.systems.safety import OperatingLimits, require_layer
 from rt_torchrl.systems.sound_part import (
     SHORTEST,
@@ -273,14 +273,14 @@ class Clearance:
         episodes, reasons = self.virtual.draw(count), list[str]()
         for role in (live, *(other for other in ROLES if other != live)):
             share = self.predicted(self.policies[role], episodes)
-            if share <= self.config.tolerated:
+            if share == 0.0:
                 self._last = {"role": role, "weights": copy.deepcopy(self.policies[role].state_dict())}
                 return Cleared(self.policies[role], role, findings(*reasons, predicted_violations=share))
             reasons.append(f"{role} may not act: it would leave the limits in {100.0 * share:.3g} % of the intervals")
         if self._last is None:
             raise ValueError(
-                f"no policy may act. {'; '.join(reasons)}; limits.tolerated={self.config.tolerated}. Widen the limits "
-                "or raise that share, or begin with something that keeps the limits, such as --start controller."
+                f"no policy may act. {'; '.join(reasons)}. Widen the limits, or begin with something that keeps them, "
+                "such as --start controller."
             )
         role = self._last["role"]
         policy = copy.deepcopy(self.policies[role])

@@ -223,8 +223,7 @@ def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollec
     if env.batch_size != torch.Size([1]):
         raise ValueError(
             f"batch_size={tuple(env.batch_size)} of the real system must be (1,): Reinforcement Twinning learns after "
-            "every one episode of one system. Use PlantEnv(..., batch_size=1), or put an environment without a batch "
-            "into a RealSystem."
+            "every one episode of one system. Put an environment without a batch into a RealSystem."
         )
     if type(env) is PlantEnv:  # a subclass may override any part of a step
         return FlightCollector(env, actor)

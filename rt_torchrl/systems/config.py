@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, SkipValidation
 
-from rt_torchrl.options import File, Limit, Positive, Share, Unbounded, array_of, configuration
+from rt_torchrl.options import File, Limit, Positive, Unbounded, array_of, configuration
 
 Range = Annotated[tuple[float | Sequence[float], float | Sequence[float]], SkipValidation]
 """Least and greatest values, which are checked in words of their own."""
@@ -86,8 +86,6 @@ class OperatingLimitsConfig:
         states: least and greatest value of states, by name, in their units.
         actions: least and greatest value of actions, by name, in their units.
         rates: greatest rate of change of actions, by name [unit/s].
-        tolerated: greatest share of the control intervals of virtual episodes in which a policy may be predicted to
-            leave the limits; beyond it the policy does not act.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -96,7 +94,6 @@ class OperatingLimitsConfig:
     states: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
     actions: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
     rates: Mapping[str, Limit] = field(default_factory=dict)
-    tolerated: Share = 0.0
 
     def __post_init__(self) -> None:
         for argument in ("states", "actions"):
@@ -114,18 +111,14 @@ class OperationConfig:
     """Options of an operation that goes on while the algorithm learns, with ``asynchronous``.
 
     Args:
-        clock: simulated: one process, in which learning takes half a window of operation, so that a run repeats to the
-            bit; for systems in simulation. wall: the system operates in a process of its own, at the pace of the
-            wall clock.
         speed: pace of a simulation on the wall clock, in seconds of the plant for each second; real systems keep their
             own time.
-        continuous: whether only the first window begins with a reset of the system; an episode is then a window of
-            operation.
+        continuous: whether only the first window begins with a reset of the system, which must be a
+            :class:`RealSystem`; an episode is then a window of operation.
 
     Raises:
-        ValueError: if an option is out of its range, or is none of its choices.
+        ValueError: if an option is out of its range.
     """
 
-    clock: Literal["simulated", "wall"] = "simulated"
     speed: Positive = 1.0
     continuous: bool = False

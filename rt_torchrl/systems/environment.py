@@ -24,7 +24,7 @@ class PlantEnv(EnvBase):
     The algorithm flies this class by a compiled scan. It flies a subclass, which may override a step, step by step, and
     that is ten times slower.
 
-    The TensorDict has these entries, each with the batch size in front:
+    The TensorDict has these entries, each with the batch size (1,) in front:
 
     =====================================  ======  ===================================================================
     ``observation``                        n_o     the tracking errors e_k
@@ -38,7 +38,6 @@ class PlantEnv(EnvBase):
 
     Args:
         plant: the plant; its own closure is the true one.
-        batch_size: number of episodes that run side by side.
         seed: seed of the generator that draws initial states and exogenous inputs.
         device: device on which the environment runs.
         compiled: whether to compile the step.
@@ -50,27 +49,24 @@ class PlantEnv(EnvBase):
             plant's own closure holds in all episodes.
 
     Raises:
-        ValueError: if ``batch_size`` or ``noise`` is out of its range.
+        ValueError: if ``noise`` is out of its range.
     """
 
     def __init__(
         self,
         plant: Plant,
         *,
-        batch_size: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
         compiled: bool = False,
         noise: float = 0.0,
         wear: Callable[[int], nn.Module] | None = None,
     ):
-        for argument, value, whole in (("batch_size", batch_size, True), ("seed", seed, True), ("noise", noise, False)):
-            require_number(argument, value, whole=whole)
-        if batch_size < 1:
-            raise ValueError(f"batch_size={batch_size} must be at least 1.")
+        require_number("seed", seed, whole=True)
+        require_number("noise", noise)
         if not 0.0 <= noise < 1.0:
             raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
-        super().__init__(device=torch.device(device), batch_size=torch.Size([batch_size]))
+        super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
         self.plant = plant.to(device)
         self._transition = compiled_if(compiled, _transition)
         self._generator = torch.Generator(device=device)
@@ -100,19 +96,9 @@ class PlantEnv(EnvBase):
         self._sensors.set_state(state["sensors"].cpu())
         self._episodes = state["episodes"]
 
-    @property
-    def present(self) -> Float[Tensor, "batch n_s"]:
-        """The state in which :meth:`go_on` begins the next window; assign it to go on from an earlier one."""
-        return self._state
-
-    @present.setter
-    def present(self, state: Float[Tensor, "batch n_s"]) -> None:
-        self._state = state.to(self.device)
-
     def _draw(self) -> tuple[Tensor, Tensor]:
-        """Initial states and exogenous inputs of the next episodes."""
-        batch = self.batch_size[0]
-        return self.plant.draw_initial_state(batch, self._generator), self.plant.draw_exogenous(batch, self._generator)
+        """Initial state and exogenous inputs of the next episode."""
+        return self.plant.draw_initial_state(1, self._generator), self.plant.draw_exogenous(1, self._generator)
 
     def pass_over(self) -> None:
         """Draw what a reset would draw, and discard it.
@@ -125,36 +111,13 @@ class PlantEnv(EnvBase):
         self.sensor_factor()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        batch, (state, exogenous) = self.batch_size[0], self._draw()
-        if self.plant.ended(state).any():
+        self._state, self._exogenous = self._draw()
+        self._step_count = 0
+        if self.plant.ended(self._state).any():
             raise ValueError(f"plant {self.plant.name!r} draws initial states in which the episode has ended.")
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or mask.all():
-            self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
-            self._state, self._exogenous = state, exogenous
-        else:
-            again = mask.reshape(batch)
-            self._step_count = torch.where(again, 0, self._step_count)
-            self._state = torch.where(again[:, None], state, self._state)
-            self._exogenous = torch.where(again[:, None, None], exogenous, self._exogenous)
-        return self._begun()
-
-    def _begun(self) -> TensorDict:
-        batch = self.batch_size[0]
-        applied = torch.zeros(batch, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        false = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
+        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
+        false = torch.zeros(1, 1, dtype=torch.bool, device=self.device)
         return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
-
-    def go_on(self) -> TensorDict:
-        """Begin the next window of operation in the present state: only exogenous inputs are drawn, and t is 0 again.
-
-        Returns:
-            What a reset returns.
-        """
-        batch = self.batch_size[0]
-        self._exogenous = self.plant.draw_exogenous(batch, self._generator)
-        self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
-        return self._begun()
 
     def begin_episode(self) -> nn.Module:
         """Count an episode and return its closure.
@@ -165,28 +128,27 @@ class PlantEnv(EnvBase):
         return self.closure
 
     @property
-    def drawn(self) -> tuple[Scenario, Float[Tensor, "batch n_s"]]:
-        """Initial states and exogenous inputs of the last reset, and the sensors' factors on the first state."""
+    def drawn(self) -> tuple[Scenario, Float[Tensor, "1 n_s"]]:
+        """Initial state and exogenous inputs of the last reset, and the sensors' factors on the first state."""
         return Scenario(self._state, self._exogenous), self._factor
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if (self._step_count == 0).any():
+        if self._step_count == 0:
             self._closure = self.begin_episode()
-        # An integer times a float would be single precision.
-        t, exogenous = self._step_count.double() * self.plant.dt, self._now()
+        t, exogenous = self._now()
         command = tensordict["action"]
         transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
             raise DivergenceError(
-                f"plant {self.plant.name!r} diverged at t = {t.max().item():g} s: state {self._state.tolist()}, "
+                f"plant {self.plant.name!r} diverged at t = {t.item():g} s: state {self._state.tolist()}, "
                 f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
             )
         # A compiled step may reuse its output buffer.
         measured = self._state * self._factor
         self._state = with_memories(self.plant, transition.state.clone(), t, measured, exogenous)
-        self._step_count = self._step_count + 1
-        over = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        self._step_count += 1
+        over = torch.full((1, 1), self._step_count >= self.plant.n_steps, device=self.device)
         ends = self.plant.end_cost is not None
         terminated = self.plant.ended(self._state).unsqueeze(-1) if ends else torch.zeros_like(over)
         truncated = over & ~terminated
@@ -202,27 +164,28 @@ class PlantEnv(EnvBase):
         )
 
     def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
-        exogenous = self._now()
+        t, exogenous = self._now()
         self._factor = self.sensor_factor()
         state = self._state * self._factor
-        observation = self.plant.observe(self._step_count.double() * self.plant.dt, state, exogenous)
+        observation = self.plant.observe(t, state, exogenous)
         read = state[..., : len(self.plant.readings)]
         entries |= {"observation": observation, "state": read, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
+    def sensor_factor(self) -> Float[Tensor, "1 n_s"]:
         """The sensors' factors on the state at the next reading, 1 + noise·w."""
-        shape, like = (self.batch_size[0], len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
+        shape, like = (1, len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
         drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
         read = [signal.name not in self.plant.memories for signal in self.plant.states]
         return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
 
-    def _now(self) -> Float[Tensor, "batch n_z"]:
-        """The exogenous input of this interval; after the last interval, that of the last interval."""
-        k = self._step_count.clamp(max=self.plant.n_steps - 1)
-        return self._exogenous[torch.arange(len(k), device=self.device), k]
+    def _now(self) -> tuple[Float[Tensor, " 1"], Float[Tensor, "1 n_z"]]:
+        """Time and exogenous input of this interval; after the last interval, the input is that of the last one."""
+        k = self._step_count
+        t = torch.full((1,), k * self.plant.dt, dtype=torch.float64, device=self.device)
+        return t, self._exogenous[:, min(k, self.plant.n_steps - 1)]
 
 
 def declare_specs(env: EnvBase, plant: Plant) -> None:
@@ -303,10 +266,7 @@ def _transition(
 
 
 class AroundSystem(EnvBase):
-    """An environment around the system ``env``, whose attributes it has where it has none of that name.
-
-    Where the system operates without resets, each window of operation counts as an episode.
-    """
+    """An environment around the system ``env``, whose attributes it has where it has none of that name."""
 
     env: EnvBase
 
@@ -319,21 +279,8 @@ class AroundSystem(EnvBase):
                 raise
             return getattr(self.env, name)
 
-    def go_on(self) -> TensorDictBase:
-        """Begin the next window of operation without a reset, if the system can.
-
-        Returns:
-            What a reset returns.
-        """
-        found: TensorDictBase = self.env.go_on()
-        self._count_window()
-        return self._gone_on(found)
-
     def begin_window(self) -> None:
-        """Count a window of operation, which a system around this one has begun."""
-        if isinstance(self.env, AroundSystem):
-            self.env.begin_window()
-        self._count_window()
+        """Begin the next window of an operation without a reset; by default nothing depends on it."""
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """State of the system; what stands around it has none that outlives an episode."""
@@ -349,13 +296,6 @@ class AroundSystem(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self.env.set_seed(seed)
-
-    def _count_window(self) -> None:
-        """Count a window; by default nothing is counted."""
-
-    def _gone_on(self, found: TensorDictBase) -> TensorDictBase:
-        """What a window begins with, made of what the system begins it with; by default that itself."""
-        return found
 
 
 def layers(env: EnvBase) -> Iterator[EnvBase]:

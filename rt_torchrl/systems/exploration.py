@@ -197,12 +197,3 @@ class BumplessPolicy(LivePolicy):
         step = torch.minimum(self._share, 0.5 * (ends[1] - ends[0]).abs())
         left = offset.sign() * (offset.abs() - step).clamp(min=0.0)
         return left if left.any() else None
-
-    def carried(self) -> dict[str, Tensor]:
-        """What goes on over the end of a window: noise and offset, as far as there are any."""
-        parts = {"noise": self._noise, "offset": self._offset}
-        return {name: value for name, value in parts.items() if value is not None}
-
-    def carry(self, carried: dict[str, Tensor]) -> None:
-        """Go on with what :meth:`carried` has returned."""
-        self._noise, self._offset = carried.get("noise"), carried.get("offset")

@@ -326,14 +326,10 @@ class RealSystem(EnvBase):
         return getattr(self.env, "pace", None)
 
     def go_on(self) -> TensorDictBase:
-        """Begin the next window of operation without a reset: the present report is its first one, and t is 0 again.
-
-        A simulation in the place of a machine is told of it, so that it does not end the episode.
-        """
-        if hasattr(innermost(self.env), "go_on"):
-            self._reported = self.env.go_on()
-        elif isinstance(self.env, AroundSystem):
-            self.env.begin_window()
+        """Begin the next window of operation without a reset: the present report is its first one, and t is 0 again."""
+        for layer in layers(self.env):
+            if isinstance(layer, AroundSystem):
+                layer.begin_window()
         self._step_count = 0
         return self._begun(self._measured(self._reported))
 

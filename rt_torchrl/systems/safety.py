@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
@@ -25,8 +25,6 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
 """Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
-KEPT = 16
-"""Number of episodes whose reports are kept: a system may operate for years."""
 TOLERANCE = 0.5
 """Share of an interval by which the system's clock may miss it."""
 ROUNDING = 1e-9
@@ -271,8 +269,8 @@ class SafetyLayer(AroundSystem):
         require_interval(env, config.interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config, self._clock = env, config, clock
-        self.reports: deque[SafetyReport] = deque(maxlen=KEPT)
-        self._episodes = 0
+        self.report, self._episodes = SafetyReport(), 0
+        """Report of the present episode; between two episodes, that of the last one."""
         self._good: dict[str, Tensor] = {}
         self._unwritten: OSError | None = None
         self._make_specs()
@@ -299,20 +297,11 @@ class SafetyLayer(AroundSystem):
         self.action_spec, self.reward_spec = action.clone(), self.env.reward_spec.clone()
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
-    @property
-    def report(self) -> SafetyReport:
-        """Report of the present episode; between two episodes, that of the last one, and before the first an empty one.
-
-        A check of a protocol with a ``report`` reads it at any time.
-        """
-        return self.reports[-1] if self.reports else SafetyReport()
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if self._unwritten is not None:
             error, self._unwritten = self._unwritten, None
             raise error  # now that nothing moves; in the episode the system came first
-        mask = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
-        reading = self.env.reset(mask, **kwargs).exclude("_reset")
+        reading = self.env.reset(**kwargs)
         self.watchdog.begin()
         if hasattr(self._fallback, "begin"):
             self._fallback.begin()
@@ -325,30 +314,21 @@ class SafetyLayer(AroundSystem):
         self._step_count, self._passed, self._last, self._good = 0, 0, None, {}
         if getattr(innermost(self.env), "reads_applied", False):
             self._last = reading["applied"].clone()  # of a machine in operation
-        self._flags = self._flag(False), self._flag(False)
-        return self._begun(reading)
-
-    def _begun(self, reading: TensorDictBase) -> TensorDictBase:
-        """What an episode or a window begins with; the machine need not say what it has applied."""
         reading = self._remember(reading)
-        if "applied" not in reading:
+        if "applied" not in reading:  # the machine need not say what it has applied
             reading["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
-        reading["tripped"], reading["refused"] = (flag.clone() for flag in self._flags)
+        reading["tripped"], reading["refused"] = self._flag(False), self._flag(False)
         return reading
 
-    def _count_window(self) -> None:
+    def begin_window(self) -> None:
+        """Begin the next window of an operation; the limits and the watchdog go on, and the report begins anew."""
         self._passed, self._step_count = self._passed + self._step_count, 0
-
-    def _gone_on(self, reading: TensorDictBase) -> TensorDictBase:
-        """The present reading once more; what the layer has found in it, its limits and its watchdog go on."""
-        return self._begun(reading.copy())
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._step_count == 0:
             # The report begins with the first step, because a reset need not be followed by a step.
-            self.reports.append(SafetyReport())
-            self._episodes += 1
+            self.report, self._episodes = SafetyReport(), self._episodes + 1
         past = self._passed + self._step_count
         t, end = (self.config.interval * k for k in (past, past + 1))
         applied, reasons = self._chosen(t, tensordict)
@@ -360,8 +340,8 @@ class SafetyLayer(AroundSystem):
         reading = self._remember(reading.copy())
         if "applied" not in self.env.full_observation_spec:
             reading["applied"] = applied.clone()
-        self._flags = self._flag(self.watchdog.tripped(end)), self._flag(not WRONG.isdisjoint(faults))
-        reading["tripped"], reading["refused"] = self._flags
+        reading["tripped"] = self._flag(self.watchdog.tripped(end))
+        reading["refused"] = self._flag(not WRONG.isdisjoint(faults))
         if reading["refused"].any():
             first = max(0, self._step_count - self.watchdog.stale)
             self.report.wrong.update(range(first, self._step_count + 1))

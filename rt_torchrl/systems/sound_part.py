@@ -121,7 +121,7 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
 def report_of(env: EnvBase) -> SafetyReport | None:
     """The report of the safety layer of a real system about its last episode; None if there is none."""
     layer = layer_of(env)
-    return layer.report if layer is not None and layer.reports else None
+    return None if layer is None else layer.report
 
 
 def _overflows(episode: TensorDictBase, dt: float) -> tuple[Bool[Tensor, " n"], list[Fault]]:

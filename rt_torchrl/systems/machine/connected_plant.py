@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import ForeignSystem
-from rt_torchrl.systems.operation.operator import Pace
+from rt_torchrl.systems.operation import Pace
 
 FRESH = 0.5
 """Share of the period for which the client waits for a new sample after it was due."""
@@ -102,8 +102,8 @@ class ConnectedPlant(ForeignSystem):
     request that the plant refuses is an error. The entry ``skipped`` is the number of samples between this reading and
     the last one that nobody read; where it is not zero, a transition is longer than one interval.
 
-    The plant must have a watchdog of its own, which brings its safe action when commands stay out, as
-    :class:`ServedPlant` has. A thread connects again, so that the pace is kept.
+    The plant must have a watchdog of its own, which brings its safe action when commands stay out. A thread connects
+    again, so that the pace is kept.
 
     The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
     readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read. The attribute

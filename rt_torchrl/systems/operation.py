@@ -1,0 +1,566 @@
+"""A real system in operation: it acts in a process of its own while the algorithm learns, in windows of episode length.
+
+docs/connect_your_machine.md explains it.
+"""
+
+import copy
+import gc
+import multiprocessing
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from rt_torchrl.interruption import safe_point
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.systems.collectors import failure, pass_over
+from rt_torchrl.systems.config import OperationConfig
+from rt_torchrl.systems.environment import ended_early
+from rt_torchrl.systems.exploration import BumplessPolicy, ExplorationConfig
+from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.safety import SafetyReport
+from rt_torchrl.systems.sound_part import EpisodeEndedError, report_of
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+
+FIRST = "first"
+"""Name of the policy or state feedback that acts before the trained policies do."""
+HANDOVER = 20
+"""Number of control intervals in which an offset of a handover as wide as the range of the action fades."""
+LOOK = 0.1
+"""Time after which the learner looks again whether Ctrl-C was pressed while it waits for a window [s]."""
+END = 10.0
+"""Time that the acting process has to end the operation [s]."""
+SWITCH = 2e-4
+"""Time for which a thread keeps Python's lock while the control loop waits for it [s]."""
+STOP = "stop"
+
+
+class Order(NamedTuple):
+    """A policy that is to take over at once, as it was when the order was given.
+
+    Attributes:
+        version: number of the order, from 0; each interval of a record names the version that acted in it.
+        name: name of the policy, such as its role.
+        weights: its weights.
+        strength: strength ξ of the exploration.
+        found: what was found about the policy before, such as ``predicted_violations``, by name.
+    """
+
+    version: int
+    name: str
+    weights: dict[str, Tensor]
+    strength: float
+    found: dict[str, float | str] | None = None
+
+    def ready(self, policies: Mapping[str, nn.Module]) -> nn.Module:
+        """The policy as a module of its own, ready to act: state feedback has made its first plan.
+
+        Args:
+            policies: a policy of each name, whose own weights stay as they are.
+        """
+        policy = copy.deepcopy(policies[self.name])
+        policy.load_state_dict(self.weights)
+        if isinstance(policy, StateFeedback):
+            policy.begin()
+        return policy
+
+
+class Window(NamedTuple):
+    """A window of operation, or the part of it before the system failed.
+
+    Attributes:
+        entries: its control intervals, of batch size ``1 k``; None if there are none.
+        ended: why the system did not reach the end of the window; None if it did.
+        report: what the safety layer did in it; None if there is no layer.
+        acted: numbers about what acted at its end, such as the times of the solves of model predictive control.
+    """
+
+    entries: TensorDict | None
+    ended: str | None = None
+    report: SafetyReport | None = None
+    acted: Mapping[str, float] | None = None
+
+
+class Pace:
+    """Waits for the beginning of each control interval.
+
+    The attribute ``late`` is by how much the last interval began after it was due [s]. An interval that begins a whole
+    period late or later is not made up for: the pace goes on from the moment when it began.
+
+    Args:
+        period: time from one beginning to the next [s].
+        clock: wall clock [s].
+        sleep: function that waits for some time [s].
+
+    Raises:
+        ValueError: if the period is not positive.
+    """
+
+    def __init__(
+        self,
+        period: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        if not period > 0.0:
+            raise ValueError(f"period={period} s of a control loop must be positive.")
+        self.period, self._clock, self._sleep = period, clock, sleep
+        self.late = 0.0
+        self._due: float | None = None
+
+    def begin(self) -> None:
+        """Begin anew: the next interval is due at once."""
+        self._due = None
+
+    def shift(self, seconds: float | None) -> None:
+        """Move all intervals to come by some time [s]; with None the present moment is when this one was due."""
+        now = self._clock()
+        self._due = now if seconds is None or self._due is None else self._due + seconds
+
+    def wait(self) -> float:
+        """Wait until the next interval is due; by how much it begins late [s]."""
+        now = self._clock()
+        due = now if self._due is None else self._due + self.period
+        if due > now:
+            self._sleep(due - now)
+            now = self._clock()
+        self.late = now - due
+        self._due = now if self.late >= self.period else due
+        return self.late
+
+
+class Operator:
+    """Steps a real system under the policies that it is ordered to follow, interval by interval.
+
+    A window of operation has the length of the plant's episode. Without ``continuous`` it begins with a reset, as an
+    episode does. With ``continuous`` only the first one does: state, offset of a handover and memory of state feedback
+    go on over the end of a window, and the plant's clock begins anew.
+
+    A window holds the entries of an episode and, for each interval, ``version``, the number of the order that acted,
+    and ``late``, by how much the interval began after it was due [s].
+
+    A window in which the system fails ends there, and the next one begins with a reset. A reset that fails is a window
+    without intervals.
+
+    An operator can be sent to another process until :meth:`start` makes the real system.
+
+    Args:
+        make_env: function that makes the real system, of batch size 1. One that keeps the time itself says so by an
+            attribute ``pace``.
+        plant: physics of the twin, which gives actuators, ranges and control interval.
+        policies: a policy of each name that an order may have.
+        exploration: parameters of the noise.
+        config: options of the operation.
+        seed: seed of the noise.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[], EnvBase],
+        plant: Plant,
+        policies: dict[str, nn.Module],
+        exploration: ExplorationConfig,
+        config: OperationConfig,
+        *,
+        seed: int,
+    ):
+        self._make_env, self._exploration, self._seed = make_env, exploration, seed
+        self.plant, self.policies, self.config = plant, policies, config
+        self.interval, self._begun = 0, False
+        self._order: Order | None = None
+        self._window: TensorDict | None = None
+        self._row: TensorDictBase | None = None
+
+    def start(self) -> None:
+        """Make the real system, and what acts on it."""
+        self.env = self._make_env()
+        generator, first = torch.Generator(device=self.env.device), next(iter(self.policies.values()))
+        generator.manual_seed(self._seed)
+        self.actor = BumplessPolicy(self.plant, first, self._exploration, intervals=HANDOVER, generator=generator)
+        pace: Pace | None = getattr(self.env, "pace", None)
+        self._keeps_time = pace is None
+        self.pace = Pace(self.plant.dt / self.config.speed) if pace is None else pace
+
+    @property
+    def length(self) -> int:
+        """Number of control intervals of a window."""
+        return self.plant.n_steps
+
+    @property
+    def version(self) -> int:
+        """Number of the order that is followed; -1 before the first."""
+        return -1 if self._order is None else self._order.version
+
+    def follow(self, order: Order, made: nn.Module | None = None) -> None:
+        """Let the policy of an order take over in the next interval.
+
+        Args:
+            order: the order.
+            made: its policy, ready to act; None makes it.
+        """
+        policy = order.ready(self.policies) if made is None else made
+        if self._order is not None and (self.config.continuous or self.interval % self.length):
+            self.actor.hand_over(policy, strength=order.strength)
+        else:
+            self.actor.policy = policy
+        self._order = order
+
+    @torch.no_grad()
+    def step(self) -> Window | None:
+        """Act for one control interval.
+
+        Returns:
+            The window that ends with this interval; None within a window.
+
+        Raises:
+            ValueError: if there is no order yet.
+            DivergenceError: if the system is a simulation that diverges.
+        """
+        if self._order is None:
+            raise ValueError("nothing acts yet: give the operator its first order.")
+        k = self.interval % self.length
+        if k == 0:
+            try:
+                self._begin()
+            except DivergenceError:
+                raise
+            except Exception as error:  # whatever a machine, its driver or its connection may raise
+                return self._ended(0, failure(error, self.plant))
+        if self._keeps_time:
+            self.pace.wait()
+        return self._interval(k)
+
+    def _interval(self, k: int) -> Window | None:
+        """Act in interval k of the window that has begun."""
+        assert self._row is not None
+        row = self._row.set("action", self.actor(self._row["observation"], self._row["state"], self._row["exogenous"]))
+        try:
+            row = self.env.step(row)
+            self._store(k, row)
+        except DivergenceError:
+            raise
+        except Exception as error:
+            return self._ended(k, failure(error, self.plant, k))
+        self._row = self.env.step_mdp(row)
+        self.interval += 1
+        if k + 1 < self.length:
+            early = row["next", "done"].any()
+            return self._ended(k + 1, str(ended_early(row["next"], k + 1, self.plant))) if early else None
+        return Window(self._window, report=report_of(self.env), acted=self._acted())
+
+    def _begin(self) -> None:
+        """Begin a window."""
+        assert self._order is not None
+        if self._begun:
+            assert isinstance(self.env, RealSystem)
+            self._row = self.env.go_on()
+            self.actor.begin_window()
+        else:
+            pass_over(self.env)
+            self._row = self.env.reset()
+            self.actor.begin(self.actor.policy, strength=self._order.strength)
+            if self._keeps_time:
+                self.pace.begin()
+        self._begun, self._window = self.config.continuous, None
+
+    def _ended(self, count: int, why: str) -> Window:
+        """The window of which ``count`` intervals were acted in; the next one begins with a reset."""
+        entries = None if self._window is None or not count else self._window[:, :count].clone()
+        self.interval, self._begun = (self.interval // self.length + 1) * self.length, False
+        return Window(entries, why, report_of(self.env) if count else None, self._acted() if count else None)
+
+    def _acted(self) -> dict[str, float] | None:
+        """Numbers about state feedback that acts."""
+        policy = self.actor.policy
+        return policy.report() if isinstance(policy, StateFeedback) else None
+
+    def _store(self, k: int, row: TensorDictBase) -> None:
+        """Copy an interval into the window, which is allocated at once because a stack at its end takes long."""
+        assert self._order is not None
+        if self._window is None:
+            self._window = row.clone().unsqueeze(1).expand(1, self.length).clone()
+            for name, kind in (("version", torch.int64), ("late", torch.float64)):
+                self._window[name] = torch.zeros(1, self.length, 1, dtype=kind)
+            self._places = [(self._window[key], key) for key in row.keys(True, True)]
+            self._version, self._late = self._window["version"], self._window["late"]
+        for place, key in self._places:
+            place[:, k] = row[key]
+        self._version[:, k], self._late[:, k] = self._order.version, self.pace.late
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next window depends on, at the end of a window."""
+        return {
+            "env": self.env.state_dict(),
+            "generator": self.actor.generator.get_state(),
+            "interval": self.interval,
+            "order": None if self._order is None else self._order._asdict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the :meth:`state_dict` of an operator that was built with the same arguments.
+
+        The operation begins with a reset, and state feedback with its first memory.
+        """
+        self.env.load_state_dict(state["env"])
+        self.actor.generator.set_state(state["generator"].cpu())
+        self.interval = state["interval"]
+        self._order, self._begun = None, False
+        if state["order"] is not None:
+            self.follow(Order(**state["order"]))
+
+
+class Operation:
+    """A real system in operation: windows come in, and policies are handed over, while the learner learns.
+
+    Note: TorchRL's asynchronous collectors are not used. Their workers wait while the learner has not taken the last
+    batch, copy weights in the middle of an interval, and do not say which version acted in which interval; here the
+    control loop waits for nothing but its clock.
+
+    The process that acts begins with the first order, and ends with :meth:`close` or with the process of the learner. A
+    failure of it is a RuntimeError in :meth:`rollout` or :meth:`hand_over`, whose message is the process's own.
+
+    ``orders`` holds the orders, by version, that later windows may have flown, or that the last one has. ``report`` is
+    what the safety layer did in the window taken last, and ``acted`` numbers about what acted at its end, if there are
+    any. ``version`` is the number of the latest order, -1 before the first.
+
+    Args:
+        operator: what acts.
+        system: the real system as the learner knows it, made by the same function; it is never stepped here.
+
+    Raises:
+        ValueError: if something that acts cannot be sent to another process, or the operation is to be continuous and
+            the system is no :class:`RealSystem`.
+    """
+
+    def __init__(self, operator: Operator, system: EnvBase):
+        if operator.config.continuous and not isinstance(system, RealSystem):
+            raise ValueError(
+                f"continuous operation needs a RealSystem, which goes on without a reset; {type(system).__name__} does "
+                "not. Leave out --operation.continuous."
+            )
+        try:
+            self._operator = pickle.dumps(operator)
+        except Exception as error:  # pickle raises many kinds
+            raise ValueError(
+                f"what acts cannot be sent to a process of its own ({type(error).__name__}: {error}); give "
+                "policies and systems that pickle."
+            ) from error
+        self.system, self.version = system, -1
+        self.orders: dict[int, Order] = {}
+        self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
+        self._state: dict[str, Any] | None = None
+        self._connection: Connection | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+
+    @property
+    def closure(self) -> nn.Module | None:
+        """The true closure of the system, as far as it is known."""
+        closure: nn.Module | None = self.system.closure
+        return closure
+
+    def hand_over(
+        self, name: str, policy: nn.Module, *, strength: float, found: dict[str, float | str] | None = None
+    ) -> None:
+        """Hand a policy over, which takes over while the system operates.
+
+        Args:
+            name: name of the policy: its role, or ``first``.
+            policy: the policy, as it is now.
+            strength: strength ξ of the exploration.
+            found: what was found about the policy before, by name.
+        """
+        weights = {key: value.detach().clone() for key, value in policy.state_dict().items()}
+        order = Order(self.version + 1, name, weights, strength, found)
+        self._pass_on(order)
+        self.version, self.orders[order.version] = order.version, order
+
+    def _pass_on(self, order: Order) -> None:
+        """Pass an order on to what acts."""
+        connection = self._begun()
+        try:
+            connection.send_bytes(pickle.dumps(order))
+        except OSError:
+            while True:
+                self._received(connection)  # after the windows, what the process has said at its end is raised
+
+    def _begun(self) -> Connection:
+        """The connection to the acting process, which is started where there is none."""
+        if self._connection is not None:
+            return self._connection
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        state = None if self._state is None else pickle.dumps(self._state)
+        self._process = context.Process(target=act, args=(theirs, self._operator, state), daemon=True)
+        self._process.start()
+        theirs.close()
+        for order in self.orders.values():
+            if self._state is None or order.version > self._state["order"]["version"]:
+                self._pass_on(order)
+        return self._connection
+
+    def waiting(self) -> bool:
+        """Whether a further window has come in already."""
+        return self._connection is not None and self._connection.poll()
+
+    def rollout(self) -> TensorDict:
+        """The oldest window that has not been taken yet, of batch size ``1 n``; waits for it if necessary.
+
+        Raises:
+            EpisodeEndedError: if the system failed in that window, or ended it; it holds the intervals before.
+        """
+        connection = self._begun()
+        while not connection.poll(LOOK):
+            safe_point()
+        window, self._state = self._received(connection)
+        assert self._state is not None
+        self.system.load_state_dict(self._state["env"])
+        return self._take(window, self._state["order"]["version"])
+
+    def _take(self, window: Window, acting: int) -> TensorDict:
+        """The control intervals of a window, where it is a whole one.
+
+        Args:
+            window: the window.
+            acting: version that acts at its end.
+        """
+        entries, self.report, self.acted = window.entries, window.report, window.acted
+        versions = [] if entries is None else entries["version"].flatten().tolist()
+        oldest = min([acting, *versions])
+        self.orders = {version: order for version, order in self.orders.items() if version >= oldest}
+        if window.ended is not None or entries is None:
+            raise EpisodeEndedError(window.ended or "the window holds no interval", entries)
+        return entries
+
+    def _received(self, connection: Connection) -> list[Any]:
+        """The next window of the acting process, and its state; an error where it has failed or ended."""
+        try:
+            kind, *parts = pickle.loads(connection.recv_bytes())
+        except (EOFError, OSError) as error:
+            raise RuntimeError("the acting process has ended without a word; it may have been killed.") from error
+        if kind == "failed":
+            raise RuntimeError(f"the acting process has failed: {parts[0]}")
+        return parts
+
+    def close(self) -> None:
+        """End the operation; the system gets its safe action from whatever stands behind it."""
+        if self._process is None or self._connection is None:
+            return
+        try:
+            self._connection.send_bytes(pickle.dumps(STOP))
+            while self._process.is_alive() and self._connection.poll(END):
+                self._connection.recv_bytes()  # windows that nobody takes would keep it from ending
+        except (EOFError, OSError):
+            pass
+        self._process.join(END)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._connection.close()
+        self._process = self._connection = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next window depends on; the window under way is not in it, and is flown again."""
+        orders = [order._asdict() for order in self.orders.values()]
+        return {"orders": orders, "version": self.version, "operator": self._state or {}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the :meth:`state_dict` of an operation that was built with the same arguments."""
+        self.close()
+        self.orders = {order["version"]: Order(**order) for order in state["orders"]}
+        self.version, self._state = state["version"], state["operator"] or None
+        if self._state is not None:
+            self.system.load_state_dict(self._state["env"])
+
+
+def system_of(env: EnvBase | Operation) -> EnvBase:
+    """The real system itself, in operation or not."""
+    return env.system if isinstance(env, Operation) else env
+
+
+# The acting process
+
+
+def act(connection: Connection, pickled: bytes, state: bytes | None) -> None:
+    """Operate the real system until the learner says stop or has gone; the main function of the acting process.
+
+    Two threads talk to the learner, so that the control loop never waits for it. The one that receives an order also
+    makes its policy and, of state feedback, the first plan: the machine code of a first one takes seconds.
+
+    Args:
+        connection: connection to the learner.
+        pickled: the pickled operator.
+        state: its pickled state to go on from; None for a new operation.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's, which then says stop
+    torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH)
+    orders: SimpleQueue[Any] = SimpleQueue()
+    windows: SimpleQueue[Any] = SimpleQueue()
+    sender = threading.Thread(target=_send, args=(connection, windows), daemon=True)
+    sender.start()
+    try:
+        operator: Operator = pickle.loads(pickled)
+        threading.Thread(target=_receive, args=(connection, orders, operator.policies), daemon=True).start()
+        _operate(operator, None if state is None else pickle.loads(state), orders, windows)
+    except BaseException as error:  # any error goes to the learner, because nobody sees this one
+        windows.put(("failed", f"{type(error).__name__}: {error}"))
+    windows.put(None)
+    sender.join()
+
+
+def _operate(
+    operator: Operator, state: dict[str, Any] | None, orders: SimpleQueue[Any], windows: SimpleQueue[Any]
+) -> None:
+    operator.start()
+    try:
+        if state is not None:
+            operator.load_state_dict(state)
+        order = orders.get()
+        gc.collect()
+        gc.freeze()  # a collection of all objects that the libraries have made would stop an action
+        while order != STOP:
+            if isinstance(order, Exception):  # of the receiving thread
+                raise order
+            if order is not None:
+                operator.follow(*order)
+            if orders.empty():  # otherwise the next order comes at once
+                window = operator.step()
+                if window is not None:
+                    windows.put(("window", window, operator.state_dict()))
+            order = None if orders.empty() else orders.get()
+    finally:
+        gc.unfreeze()  # otherwise libraries report at the end of the process what nobody has freed
+        operator.env.close()
+
+
+def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[str, nn.Module]) -> None:
+    try:
+        while True:
+            order = pickle.loads(connection.recv_bytes())
+            # A policy is made in less than a millisecond, and state feedback with its first plan in seconds.
+            orders.put(STOP if order == STOP else (order, order.ready(policies)))
+    except (EOFError, OSError):
+        orders.put(STOP)  # a learner that has gone
+    except Exception as error:  # such as a model that diverges under every first plan
+        orders.put(error)
+
+
+def _send(connection: Connection, windows: SimpleQueue[Any]) -> None:
+    try:
+        while (window := windows.get()) is not None:
+            connection.send_bytes(pickle.dumps(window))
+    except OSError:
+        return  # a learner that has gone
