@@ -157,9 +157,7 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
     """The times of all contenders on one plant, the smaller sizes first."""
     system, rows = system_of(name, config.policy), list[Row]()
     contenders = {
-        engine: engine_of(engine, system)
-        for engine in config.engines
-        if refusal(engine, system.plant) is None
+        engine: engine_of(engine, system) for engine in config.engines if refusal(engine, system.plant) is None
     }
     contenders |= {peer: make(system) for peer, make in peers.items()}
     for steps, batch in sorted(
