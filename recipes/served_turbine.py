@@ -23,7 +23,6 @@ from wind_turbine import plant_figures
 from rt_torchrl import OperationConfig, Plant, SafetyConfig, configuration, main_of
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.options import Positive
-from rt_torchrl.plants.plant import with_memories
 from rt_torchrl.plants.signal import bounds
 
 HOST, WRITTEN_AT = "127.0.0.1", 1000
@@ -84,9 +83,9 @@ class ServedPlant:
         """Run one interval under the command, or under the safe action."""
         asked, (low, high) = torch.tensor([command], dtype=torch.float64), bounds(self.plant.actions)
         valid = answered == self.sample and bool(((asked >= low) & (asked <= high)).all())  # NaN is not
-        t, state, z = torch.tensor([self._k * self.plant.dt]).double(), self._state, self._inputs[:, self._k]
-        step = self.plant.step(t, state, asked if valid else self.safe, z, self.plant.closure)
-        self._state, self._applied = with_memories(self.plant, step.state, t, state, z), step.applied
+        t, z = torch.tensor([self._k * self.plant.dt]).double(), self._inputs[:, self._k]
+        step = self.plant.step(t, self._state, asked if valid else self.safe, z, self.plant.closure)
+        self._state, self._applied = step.state, step.applied
         self.sample, self._k = self.sample + 1, self._k + 1
         if self._k == self.plant.n_steps:
             self._inputs, self._k = self.plant.draw_exogenous(1, self._generator), 0

@@ -18,30 +18,25 @@ from rt_torchrl import (
     SensorRecord,
     Trajectory,
     sensor_record,
-    sensors_of,
 )
-from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.closures import NeuralPolar, QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.resampling import filled, initial_spread, logged_readings, resample
-from rt_torchrl.fit.uncertainty import band, named_values
+from rt_torchrl.fit.uncertainty import named_values
 from rt_torchrl.plants.signal import bounds
 
 Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
 """Flies the episodes whose records are one simulation, of a plant with a closure."""
 Simulated = tuple[list[SensorRecord], Tensor | None]
 """Records of one simulation, and the spread of their first states; None if nothing is known of these."""
-POINTS = 200
-"""Number of visited points, or a few more, at which bands are compared with the true curve."""
 HELD = 20
 """Number of control intervals for which a random command is held."""
 
@@ -249,90 +244,3 @@ LOGS: dict[str, tuple[str, tuple[str, ...], Logging]] = {
     "coarse, partial, dropped": ("cascaded_tanks", ("sensed_level",), Logging(every=5, dropped=0.02, missing=0.1)),
 }
 """Plant, sensors and logging of the simulated logs."""
-
-
-class CurveCase(NamedTuple):
-    """What is simulated for a curve: a true law that the closure's own law does not hold, and a neural closure."""
-
-    plant: Callable[[], Plant]
-    start: Callable[[torch.Generator], nn.Module]
-    sensors: tuple[str, ...]
-    prior: float
-    flights: Flights | None = None
-
-
-class Bent(nn.Module):
-    """A law beside which something is that only a perceptron can learn.
-
-    Args:
-        law: the law.
-        bend: function of the features that is added.
-    """
-
-    def __init__(self, law: nn.Module, bend: Callable[[Tensor], Tensor]):
-        super().__init__()
-        self.law, self.bend = law, bend
-
-    def forward(self, features: Tensor) -> Tensor:
-        return self.law(features) + self.bend(features)
-
-
-def swollen(features: Tensor) -> Tensor:
-    """More power where the blades are flat, by 0.03 of C_p at λ = 7."""
-    lam, beta = features.unbind(-1)
-    return 0.03 * torch.exp(-(((lam - 7.0) / 2.0) ** 2) - (beta / 8.0) ** 2).unsqueeze(-1)
-
-
-def late_stall(features: Tensor) -> Tensor:
-    """More lift and drag at small angles of attack."""
-    sine, cosine = features.unbind(-1)
-    return torch.stack([0.2 * sine * cosine**3, 0.1 * sine**2 * cosine**2], -1)
-
-
-def wavy_outlet(features: Tensor) -> Tensor:
-    """An upper outlet whose flow is not in proportion to its level."""
-    flow = 0.015 * torch.sin(features[..., 0] / 6.0)
-    return torch.stack([-flow, flow], -1)
-
-
-HIDDEN = (8,)
-"""Width of the perceptrons' hidden layers; more weights are told less by one record."""
-CURVES: dict[str, CurveCase] = {
-    "wind_turbine": CurveCase(
-        lambda: WindTurbine(closure=Bent(SaintDrenan.from_set("BestFitToROSCOTable"), swollen)),
-        lambda g: NeuralPowerCoefficient(SaintDrenan.from_set("BestFitToROSCOTable"), hidden=HIDDEN, generator=g),
-        ("rotor_speed",),
-        0.1,
-        turbine_flights,
-    ),
-    "flapping_wing": CurveCase(
-        lambda: FlappingWing(horizon=0.5, closure=Bent(QuasiSteadyPolar.true(), late_stall)),
-        lambda g: NeuralPolar(QuasiSteadyPolar.draw(g, spread=0.1), hidden=HIDDEN, generator=g),
-        ("forward_position", "height", "forward_speed", "climb_speed"),
-        3.0,
-    ),
-    "cascaded_tanks": CurveCase(
-        lambda: CascadedTanks(closure=Bent(Hydraulics.true(), wavy_outlet)),
-        lambda g: NeuralHydraulics(Hydraulics.true().requires_grad_(True), hidden=HIDDEN, generator=g),
-        ("upper_level", "lower_level"),
-        3.0,
-    ),
-}
-"""The simulations of curves, by the plant's name; each prior lets the weights of a perceptron be of order one."""
-
-
-def curves_of(case: CurveCase, simulations: int) -> Tensor:
-    """Share of the points where the system has been at which the 95 % band holds the true curve, in each simulation."""
-    plant, generator, found = case.plant(), torch.Generator().manual_seed(0), []
-    sensors, config = sensors_of(plant, case.sensors), EstimationConfig(iterations=60, rounds=4, prior=case.prior)
-    for _ in range(simulations):
-        flown = (case.flights or random_flights)(plant, plant.closure, generator)
-        records = with_noise([sensor_record(plant, sensors, one) for one in flown], 0.01, generator)
-        estimate = Estimation(DigitalTwin(plant, case.start(generator)), sensors, config=config).run(records)
-        every = torch.cat([visited_features(plant, one).flatten(0, -2) for one in flown])
-        points = every[:: max(1, len(every) // POINTS)]
-        drawn = band(estimate.uncertainty, torch.arange(len(points)).double(), points)
-        with torch.no_grad():
-            true = plant.closure(points)[:, 0]
-        found.append(((true >= drawn.low) & (true <= drawn.high)).double().mean())
-    return torch.stack(found)

@@ -129,7 +129,7 @@ def test_the_memory_of_the_fallback_goes_on_while_the_policy_acts():
     limits = OperatingLimitsConfig(states={"velocity": (-0.7, 0.7)})
     config = RunConfig(twinning=dataclasses.replace(SMALL, limits=limits), seed=3)
     plant = LinearQuadratic(horizon=4.0)
-    env = simulated(plant, config, Lagged, device=torch.device("cpu"), compiled=False)
+    env = simulated(plant, config, Lagged, device=torch.device("cpu"))
     row, memory, fallback, acted = env.reset(), 0.0, [], {}
     for k in range(40):
         memory = 0.8 * memory + 0.2 * row["state"][0, 1].item()

@@ -260,7 +260,6 @@ def train(tmp_path, monkeypatch):
         return watch.found
 
     monkeypatch.setattr(Run, "_train", watched)
-    monkeypatch.setattr("rt_torchrl.runs.run.can_compile", lambda device: False)
     return run
 
 

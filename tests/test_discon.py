@@ -315,7 +315,7 @@ def test_a_controller_by_a_library_is_judged_as_a_classical_one(scheduled):
     plant = WindTurbine(observe=("scheduled",), horizon=20.0)
 
     class Ours(DISCON):
-        def __init__(self, plant, *, compiled=False):
+        def __init__(self, plant):
             super().__init__(plant, file)
 
     require_controller("baselines['ours']", Ours, plant)

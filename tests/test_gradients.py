@@ -1,6 +1,5 @@
 """The gradient engines against each other and against central differences."""
 
-import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -15,7 +14,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP, mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import parallel
-from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
 
 PLANTS = {
@@ -85,16 +83,15 @@ class Case:
         self.state_weights = torch.cat([self.state_weights[:-1].repeat_interleave(factor, 0), last])
         return self
 
-    def rollout(self, engine, compiled=False):
+    def rollout(self, engine):
         """The rollout by an engine, which lasts."""
-        if (engine, compiled) not in self.rollouts:
-            made = Rollout(self.plant, self.closure, self.policy, engine=engine, compiled=compiled)
-            self.rollouts[engine, compiled] = made
-        return self.rollouts[engine, compiled]
+        if engine not in self.rollouts:
+            self.rollouts[engine] = Rollout(self.plant, self.closure, self.policy, engine=engine)
+        return self.rollouts[engine]
 
-    def cost(self, engine="autograd", compiled=False):
+    def cost(self, engine="autograd"):
         """J_a of each realisation, weighed by its number, and a random linear functional of all states and actions."""
-        rollout, given = self.rollout(engine, compiled), (self.initial_state, self.exogenous, self.command)
+        rollout, given = self.rollout(engine), (self.initial_state, self.exogenous, self.command)
         flown, costs = rollout(*given, start=3.0), rollout.costs(*given, start=3.0)
         projected = (self.state_weights * flown.states / self.state_scale).sum()
         projected = projected + (self.action_weights * flown.actions / self.action_scale).sum()
@@ -114,11 +111,11 @@ class Case:
                 found[f"{role}.{name}"] = (weight, torch.ones((), dtype=torch.float64))
         return found
 
-    def gradients(self, engine, compiled=False):
+    def gradients(self, engine):
         """The cost and its gradients, by name; zero by a weight that is not used."""
         leaves, cost = (
             {name: leaf.requires_grad_() for name, (leaf, _) in self.leaves().items()},
-            self.cost(engine, compiled),
+            self.cost(engine),
         )
         found = torch.autograd.grad(cost, leaves.values(), allow_unused=True, materialize_grads=True)
         return {"cost": cost.detach(), **dict(zip(leaves, found, strict=True))}
@@ -232,29 +229,6 @@ def test_products_are_made_in_pieces(driver, monkeypatch):
     monkeypatch.undo()
     assert_equal(cut, whole, 1e-13)  # rounding
     assert_equal(cut, case.gradients("autograd"))
-
-
-COMPARISON = """
-import sys
-sys.path.insert(0, "tests")
-from test_gradients import Case, LinearQuadratic, assert_equal
-
-for driver, batch in (("commands", 1), ("policy", 4)):
-    case = Case(LinearQuadratic(dt=0.1, horizon=2.0), "own", driver, batch)
-    # Like the start of a record: a slice, whose strides are not those of a fresh tensor.
-    case.initial_state = case.initial_state.unsqueeze(1).repeat(1, 5, 1)[:, 0]
-    # Fused multiply-adds and another order of the sums.
-    assert_equal(case.gradients("parallel", compiled=True), case.gradients("parallel"), 1e-11)
-print("compared")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
-def test_compiled_equals_eager():
-    """The test runs in a process of its own, because the run-time checks of this one cannot be compiled."""
-    done = fresh_process.run(COMPARISON)
-    assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]
 
 
 class Following(LinearQuadratic):

@@ -73,7 +73,7 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
     gradients = {}
     for engine in ("native", "odeint_adjoint"):
         closure = LinearClosure([[0.0, 0.0], [-0.2, 0.1]])
-        twin = make_twin(plant, closure, HypothesesConfig(), engine=engine, compiled=engine != "native")
+        twin = make_twin(plant, closure, HypothesesConfig(), engine=engine)
         for name in twin.twins:
             twin.weights = {name: 1.0}
             gradients[engine, name] = torch.autograd.grad(twin.cost(policy, *scenario), policy.gain)[0]

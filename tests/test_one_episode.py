@@ -87,7 +87,6 @@ def test_torchrl_is_in_the_path_that_runs_by_default_which_goes_through_few_func
 
 def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch):
     calls = counted(monkeypatch, torchdiffeq, "odeint_adjoint")
-    monkeypatch.setattr("rt_torchrl.runs.run.can_compile", lambda device: False)  # takes minutes
     few = ("--twinning.planner.method", "single_start", "--twinning.planner.iterations", "1")
     few += ("--twinning.planner.realisations", "1", "--twinning.assimilation.iterations", "1")
     few += ("--twinning.virtual-episodes", "1")

@@ -77,7 +77,7 @@ def test_it_acts_on_the_real_system_as_it_flies_in_simulation(forecast):
     cost = control_cost(PLANT, expected)[0]
     torch.testing.assert_close(-flown["next", "reward"].mean(), cost, rtol=1e-9, atol=1e-12)
     found = controller.report()
-    assert found["late_solves"] == found["diverged_solves"] == 0.0 and len(controller.solves) == PLANT.n_steps
+    assert found["diverged_solves"] == 0.0 and len(controller.solves) == PLANT.n_steps
     assert 0.0 < found["solve_median"] <= found["solve_max"]
 
 
@@ -154,18 +154,6 @@ def test_it_plans_on_the_closure_as_it_is_trained():
     assert {name for name, _ in controller.named_parameters()} == {"closure.matrix"}
 
 
-def test_the_first_action_is_never_late():
-    """The plan that is made before the episode begins goes on; without it the first solve has no deadline."""
-    controller, (state, exogenous) = control(deadline=1e-9), episodes(batch=1)
-    controller.begin()
-    controller.act(0.0, state, exogenous[:, 0])
-    assert [solve.late for solve in controller.solves] == [True] and controller.report()["late_solves"] == 1.0
-    on_the_real_system(controller, PlantEnv(PLANT, seed=4))
-    assert controller.report()["late_solves"] == PLANT.n_steps
-    # Simulated episodes know no wall clock.
-    assert torch.equal(controller.fly(state, exogenous).actions, control().fly(state, exogenous).actions)
-
-
 class Fragile(LinearQuadratic):
     """A plant that diverges where it is pushed to the right, from a position on."""
 
@@ -239,17 +227,16 @@ def matrices(plant):
     return A, total @ np.array(plant.B), total @ np.array(plant.D), np.array(plant.Q), np.array(plant.R)
 
 
-def quadratic_program(plant, s_0, z, price):
-    """The optimal actions of a window, whose end costs ``price`` |s|², as a bounded least-squares problem."""
+def quadratic_program(plant, s_0, z):
+    """The optimal actions of a window as a bounded least-squares problem."""
     A, B, D, Q, R = matrices(plant)
-    root, weight, n = np.linalg.cholesky(Q).T, np.sqrt(price / plant.dt), len(z)
+    root, n = np.linalg.cholesky(Q).T, len(z)
     gain, free, rows, rest = np.zeros((2, n)), s_0.copy(), [], []
     for now, z_k in zip(np.eye(n), z, strict=True):
         rows += [root @ gain, np.sqrt(R[0, 0]) * now[None]]
         rest += [root @ free, np.zeros(1)]
         gain, free = A @ gain + B * now, A @ free + D[:, 0] * z_k
-    matrix, side = np.concatenate([*rows, weight * gain]), -np.concatenate([*rest, weight * free])
-    return lsq_linear(matrix, side, bounds=(-2.0, 2.0), tol=1e-14).x
+    return lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14).x
 
 
 class Scheduled:
@@ -263,52 +250,32 @@ class Scheduled:
         return self.inputs[:, first : first + n]
 
 
-@pytest.mark.parametrize("price", [0.0, 8.0])
-def test_plans_are_those_of_a_quadratic_program(price):
+def test_plans_are_those_of_a_quadratic_program():
     state, inputs = 2.0 * episodes(3)[0], PLANT.draw_exogenous(3, seeded(2))
     config = PredictiveConfig(horizon=1.0, tolerance=0.0, iterations=300)
-    controller = RecedingHorizon(
-        PLANT,
-        PLANT.closure,
-        config,
-        forecast=Scheduled(inputs, PLANT.dt),
-        terminal=lambda end: price * end.square().sum(-1),
-    )
+    controller = RecedingHorizon(PLANT, PLANT.closure, config, forecast=Scheduled(inputs, PLANT.dt))
     found, bounded = controller.plan(0.4, state, inputs[:, 4]), 0
     for episode in range(3):
-        wanted = quadratic_program(PLANT, state[episode].numpy(), inputs[episode, 4:14, 0].numpy(), price)
+        wanted = quadratic_program(PLANT, state[episode].numpy(), inputs[episode, 4:14, 0].numpy())
         np.testing.assert_allclose(found[episode, :, 0].numpy(), wanted, atol=2e-4)
         bounded += (np.abs(wanted) > 2.0 - 1e-9).sum()
     assert bounded > 0
 
 
-def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
+def test_a_long_horizon_is_the_linear_quadratic_regulator():
     plant = LinearQuadratic(horizon=3.0, noise=0.0)
     A, B, _, Q, R = matrices(plant)
     P = solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    value = torch.from_numpy(P * plant.dt)
-    config = PredictiveConfig(horizon=0.3, tolerance=0.0, iterations=200)
-    controller = RecedingHorizon(plant, plant.closure, config, terminal=lambda end: ((end @ value) * end).sum(-1))
+    config = PredictiveConfig(horizon=8.0, tolerance=0.0, iterations=500)
+    controller = RecedingHorizon(plant, plant.closure, config)
     state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
     flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
     s = state.numpy().T
     for k in range(plant.n_steps):
         np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
         s = A @ s - B @ K @ s
-    assert len(controller.solves) == 2 * plant.n_steps and not any(solve.late for solve in controller.solves)
-
-
-def test_late_solves_leave_the_last_plan():
-    state, exogenous = episodes(batch=1)
-    late = RecedingHorizon(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0, period=0.2, deadline=1e-9))
-    first, second = (late.plan(0.1 * k, state, exogenous[:, k]) for k in (0, 2))
-    assert [solve.late for solve in late.solves] == [False, True]
-    torch.testing.assert_close(second[:, :-2], first[:, 2:], rtol=0.0, atol=1e-15)
-    assert (second[:, -2:] == first[:, -1]).all()
-    late.begin()
-    late.plan(0.0, state, exogenous[:, 0])
-    assert not late.solves[-1].late  # there is no plan to go on with
+    assert len(controller.solves) == 2 * plant.n_steps
 
 
 @pytest.mark.parametrize("name", ["held", "decaying"])

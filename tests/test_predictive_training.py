@@ -56,7 +56,7 @@ def test_it_acts_the_twin_is_fitted_and_the_other_half_learns(tmp_path, rule, na
     run = training(tmp_path, 4, twinning=learner(name) | referee(rule=rule))
     records = run.train()["episodes"]
     acted = [record for record in records if record["live"] == "model_based"]
-    assert acted and all(record["late_solves"] == 0.0 < record["solve_median"] for record in acted)
+    assert acted and all(record["diverged_solves"] == 0.0 < record["solve_median"] for record in acted)
     for record in records:
         assert record["J_a_plan"] == record["J_a_plan_before"] and record["plan_accepted"] == 1.0
         assert ("solve_median" in record) == (record["live"] == "model_based") and "critic_loss" in record
@@ -220,7 +220,7 @@ def test_recipes_take_it_with_other_options(tmp_path, name, options):
     module.main(from_command_line(module.Config, words))
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())["episodes"]
     acted = [record for record in found if "solve_median" in record]
-    assert acted and all(record["late_solves"] == 0.0 < record["solve_median"] for record in acted)
+    assert acted and all(record["diverged_solves"] == 0.0 < record["solve_median"] for record in acted)
     assert len(found) == 3 and (len(acted) == 3 or ARM not in options)
     if name == "wind_turbine":
         assert all(record["real_cost"] < 0.5 for record in acted), [record["real_cost"] for record in acted]

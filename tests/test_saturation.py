@@ -1,7 +1,7 @@
-"""Saturation properties against CoolProp, and the cache of their fit."""
+"""Saturation properties against CoolProp."""
 
 import math
-from importlib.metadata import PackageNotFoundError
+import sys
 
 import CoolProp.CoolProp as CP
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from seeds_and_numbers import double
 
 from rt_torchrl.envs.cryogenic_tank import saturation
-from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
+from rt_torchrl.envs.cryogenic_tank.saturation import Saturation
 
 LOW, HIGH = 80e3, 900e3
 KEYS = (("T", 0), ("D", 0), ("D", 1), ("H", 0), ("H", 1))
@@ -26,15 +26,6 @@ def slopes_of_coolprop(fluid, p):
             column.append(state.first_saturation_deriv(key, CP.iP))
         columns.append(column)
     return np.array(columns)
-
-
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    """An empty cache, on disk and in memory."""
-    monkeypatch.setattr(saturation, "cache_folder", lambda: tmp_path / "deep" / "cache")
-    saturation.coefficients.cache_clear()
-    yield tmp_path / "deep" / "cache"
-    saturation.coefficients.cache_clear()
 
 
 # Properties
@@ -103,69 +94,16 @@ def test_check_names_the_worst_pressure_and_accepts_the_ends():
 def test_a_fit_that_misses_its_tolerance_raises(monkeypatch):
     monkeypatch.setattr(saturation, "TOLERANCE", 1e-12)
     with pytest.raises(ValueError, match="narrow the range"):
-        saturation.fit("Hydrogen", LOW, HIGH)
+        saturation.coefficients("Hydrogen", LOW, 0.99 * HIGH)
 
 
-# Cache
-
-
-def forbidden(*arguments):
-    raise AssertionError("fitted although it was cached")
-
-
-def test_a_fit_is_made_once_and_kept(own_cache, monkeypatch):
-    first = Saturation().table
-    (path,) = own_cache.iterdir()  # and no half-written file beside it
-    monkeypatch.setattr(saturation, "fit", forbidden)
-    assert torch.equal(Saturation().table, first)  # from memory
-    saturation.coefficients.cache_clear()
-    assert torch.equal(Saturation().table, first)  # from the file
-    path.unlink()
-    saturation.coefficients.cache_clear()
-    with pytest.raises(AssertionError, match="fitted"):
-        Saturation()
-
-
-def test_modules_do_not_share_their_buffers(own_cache):
+def test_modules_do_not_share_their_buffers():
     one, other = Saturation(), Saturation()
     one.table.zero_()
     assert other.table.abs().max() > 0
 
 
-def damaged(path, how):
-    content, middle = path.read_bytes(), path.stat().st_size // 2
-    if how in ("empty", "flipped"):
-        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-        path.write_bytes(flipped if how == "flipped" else b"")
-    else:
-        table = np.load(path)["table"]
-        np.savez(path, table=table * math.nan if how == "nan" else table[:-1])
-
-
-@pytest.mark.parametrize("how", ["empty", "flipped", "nan", "shape"])
-def test_a_damaged_cache_is_fitted_again(own_cache, how, monkeypatch):
-    whole = Saturation().table
-    (path,) = own_cache.iterdir()
-    damaged(path, how)
-    saturation.coefficients.cache_clear()
-    assert torch.equal(Saturation().table, whole)
-    saturation.coefficients.cache_clear()
-    monkeypatch.setattr(saturation, "fit", forbidden)
-    assert torch.equal(Saturation().table, whole)  # the file was mended
-
-
-def test_without_coolprop_the_extra_is_named(own_cache, monkeypatch):
-    def missing(name):
-        raise PackageNotFoundError(name)
-
-    monkeypatch.setattr(saturation, "version", missing)
+def test_without_coolprop_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "CoolProp.CoolProp", None)
     with pytest.raises(ValueError, match=r"fluids need CoolProp: .*rt_torchrl\[tank\]"):
-        Saturation()
-
-
-def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setattr(saturation, "cache_folder", lambda: tmp_path / "file")
-    saturation.coefficients.cache_clear()
-    assert Properties(*Saturation()(double(500e3))).T.isfinite().all()
-    saturation.coefficients.cache_clear()
+        Saturation("Methane")

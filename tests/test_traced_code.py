@@ -48,7 +48,7 @@ def test_refused_with_the_line_of_the_code_and_the_remedy(case):
 def test_no_function_of_its_arguments_is_refused_with_the_remedy(case):
     (snippet, word), remedy = IMPURE[case], "Policy, closure and plant must|Rows are systems of their own"
     with pytest.raises(ImpureError, match=f"{word}.*({remedy})"):
-        Native(compiled=False).end_states(snippet, *signals(11, 3))
+        Native().end_states(snippet, *signals(11, 3))
 
 
 @pytest.mark.parametrize("case", MIXED)
@@ -91,8 +91,8 @@ def test_what_is_no_number_refuses_no_code(where, wanted):
     for number in (torch.nan, 0.0):
         with torch.set_grad_enabled(wanted):
             begin = torch.full_like(state, number) if where == "state" else state
-            found = Native(compiled=False).end_states(interval, begin, drive)
-            exact = Autograd(compiled=False).end_states(interval, begin, drive)
+            found = Native().end_states(interval, begin, drive)
+            exact = Autograd().end_states(interval, begin, drive)
         torch.testing.assert_close(found, exact, equal_nan=True)
         spoiled.copy_(before)
     assert code.code_of(interval, state, drive) is not None
@@ -123,8 +123,8 @@ def test_a_buffer_is_an_input(change, monkeypatch):
     snippet.register_buffer("limit", torch.tensor(torch.inf, dtype=torch.float64))
     state, drive = signals(4, 5)
     for _ in range(3):
-        found = Native(compiled=False).end_states(snippet, state, drive)
-        torch.testing.assert_close(found, Autograd(compiled=False).end_states(snippet, state, drive))
+        found = Native().end_states(snippet, state, drive)
+        torch.testing.assert_close(found, Autograd().end_states(snippet, state, drive))
         BUFFERS[change](snippet.gain)
     assert len(made) == 1
 
@@ -143,8 +143,8 @@ def test_a_gradient_that_is_no_number_is_not_traced_again_and_again(share, monke
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for _ in range(6):
-            ends = Native(compiled=False).end_states(snippet, state.requires_grad_(), drive)
-            exact = Autograd(compiled=False).end_states(snippet, state, drive)
+            ends = Native().end_states(snippet, state.requires_grad_(), drive)
+            exact = Autograd().end_states(snippet, state, drive)
             torch.testing.assert_close(ends, exact)
     assert len(made) == (1 if share else code.TRIES)
     assert [str(each.message) for each in said if "no finite gradient" in str(each.message)] == [] or not share
@@ -155,7 +155,7 @@ def test_the_engine_parallel_takes_attention():
     """Whose operator has a backward pass, and no forward-mode derivative."""
     (snippet, _), (state, drive) = EQUAL["scaled dot product"], signals(4, 3)
     gradients = []
-    for engine in (Parallel(compiled=False), Autograd(compiled=False)):
+    for engine in (Parallel(), Autograd()):
         ends = engine.end_states(snippet, state.requires_grad_(), drive)
         gradients.append(torch.autograd.grad(ends.square().sum(), [state, snippet.w0]))
     torch.testing.assert_close(*gradients)

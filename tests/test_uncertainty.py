@@ -1,4 +1,4 @@
-"""Standard errors, regions, bands, simulations and counted intervals, against closed forms and Monte Carlo."""
+"""Standard errors, simulations and counted intervals, against closed forms and Monte Carlo."""
 
 import functools
 import math
@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from interval_coverage import CASES, CURVES, LOGS, coverage, curves_of, logged, recorded
+from interval_coverage import CASES, LOGS, coverage, logged, recorded
 from linear_quadratic import LinearClosure
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
@@ -16,7 +16,7 @@ from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
 from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of, state_sensors
-from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values
+from rt_torchrl.fit.uncertainty import Uncertainty, named_values
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 ROBUST = EstimationConfig(errors="robust")
@@ -48,16 +48,12 @@ def exact_covariance():
     return NOISE**2 * np.linalg.inv(X.T @ X)[:2, :2]
 
 
-def test_errors_correlations_and_bands_are_those_of_regression():
+def test_errors_and_correlations_are_those_of_regression():
     found, C = line_estimate().uncertainty, exact_covariance()
     np.testing.assert_allclose(found.weights_covariance.numpy(), C, rtol=1e-6)
     assert found.correlations()[0, 1].item() == pytest.approx(C[0, 1] / math.sqrt(C[0, 0] * C[1, 1]))
     low, high = found.intervals(0.95)["w[0]"]
     assert (high - low) / 2.0 == pytest.approx(1.959964 * math.sqrt(C[0, 0]))
-    x = torch.linspace(-3.0, 3.0, 7).double()
-    drawn, features = band(found, x, x[:, None]), np.stack([np.ones(7), x.numpy()], -1)
-    deviation = np.sqrt(np.einsum("pi,ij,pj->p", features, C, features))
-    np.testing.assert_allclose(0.5 * (drawn.high - drawn.low).numpy(), 1.959964 * deviation, rtol=1e-5)
 
 
 class InUnits(Slope):
@@ -97,9 +93,8 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         assert "the data say nothing of wind" in warning if wind == 0.0 else "calm and wind apart: 1 comb" in warning
         assert found.correlations()[:, 1].isnan().all()
         # The slope in the wind of the record is known, that in any other wind is not.
-        x = torch.tensor([wind, wind + 1.0]).double()
-        width = band(found, x, x[:, None])
-        assert (width.high - width.low).isinf().tolist() == [False, True]
+        slopes = torch.tensor([[1.0, wind], [1.0, wind + 1.0]]).double() * closure.by_weight
+        assert found.untold(slopes).tolist() == [False, True]
 
 
 def regression_error(n, dt, *, smooth):
@@ -203,10 +198,3 @@ def test_intervals_from_logs_hold_the_truth(name, errors):
     for level, inside in ((0.95, found.inside), (0.68, found.inside_68)):
         shares = inside[~inside.isnan()]
         assert (shares - level).abs().max() < 3.0 * np.sqrt(level * (1.0 - level) / 100) + 0.01, (level, shares)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", CURVES)
-def test_bands_of_neural_closures_hold_the_curve(name):
-    """C_p, C_L and the outlet of a tank, pointwise where the records have been."""
-    assert curves_of(CURVES[name], 20).mean() >= 0.85

@@ -12,7 +12,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded
 
-from rt_torchrl import StackedObservations, check_plant
+from rt_torchrl import check_plant
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine import plant as module
 from rt_torchrl.envs.wind_turbine import rosco as adapter
@@ -488,26 +488,3 @@ def test_the_measures_of_the_peers():
         },
         rel=1e-9,
     )
-
-
-def test_the_controllers_side_remembers_as_a_step_of_the_plant_does():
-    """Answers to a simulator whose rotor stands still in what it reports; the wind is the plant's draw."""
-    plant = StackedObservations(WindTurbine(horizon=5.0), 2)
-    generator = torch.Generator().manual_seed(3)
-    start = plant.draw_initial_state(1, generator)[0]
-    wind = plant.draw_exogenous(1, generator)[0, :, 0].numpy()
-    every, seen = steps_of(plant), []
-
-    def decide(state, now, report):
-        t = torch.tensor(len(seen) * plant.dt, dtype=torch.float64)
-        seen.append(plant.observe(t, state, torch.tensor([now], dtype=torch.float64)))
-        return state[4:6]
-
-    answer = adapter.Answer(plant, start, wind, decide, every)
-    for k in range(4 * every):
-        answer.call_controller({"rot_speed": 1.0 + 0.01 * k, "ws": wind[k // every]})
-    n = len(seen[0]) // 3
-    for k in range(4):
-        expected = torch.cat([seen[max(k - j, 0)][:n] for j in range(3)])
-        torch.testing.assert_close(seen[k], expected, rtol=0.0, atol=0.0)
-    assert not torch.equal(seen[3][:n], seen[2][:n])

@@ -1,28 +1,17 @@
 """Saturation properties of a pure fluid as differentiable functions of pressure."""
 
-import contextlib
-import io
 import math
-import zipfile
-import zlib
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from platformdirs import user_cache_path
 from torch import Tensor, nn
-
-from rt_torchrl.atomic_file import write_atomically
 
 CELLS = 128
 """Number of pieces of the spline: over 80 … 900 kPa of hydrogen values err by 1e-7 of their maximum, slopes by 2e-6."""
 DEGREE = 5
-LAYOUT = 2
-"""Version of the cached array; a file of another version is fitted again."""
 TOLERANCE = 1e-6
 """Greatest error of a value between the nodes, over its maximum, at which a fit is accepted."""
 CRITICAL_SHARE = 0.95
@@ -48,8 +37,8 @@ class Saturation(nn.Module):
     .. math:: f(p) = \sum_{m=0}^5 c_{im} u^m, \quad u = \frac{\ln(p/p_{lo})}{h} - i, \qquad
         \frac{df}{dp} = \frac{1}{hp}\sum_{m=1}^5 m\,c_{im} u^{m-1}.
 
-    Four derivatives are continuous; the plant needs one, and its adjoint a second. The fit to CoolProp is made when it
-    is first needed, and is kept in the user's cache. It takes about a second, most of it to load CoolProp.
+    Four derivatives are continuous; the plant needs one, and its adjoint a second. The fit to CoolProp is made when a
+    process first needs it, and takes about a second, most of it to load CoolProp.
 
     Outside the range of pressure a property is NaN, never its value at the nearest end. A trajectory that leaves the
     range therefore stops with the library's ``DivergenceError``. :meth:`check` refuses such pressures at once.
@@ -117,42 +106,7 @@ class Saturation(nn.Module):
 
 @cache
 def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
-    """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
-    try:  # another version of CoolProp may have other equations of state
-        path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
-    except PackageNotFoundError as error:
-        raise ValueError(
-            "fluids need CoolProp: install the extra, pip install 'rt_torchrl[tank]', or run uv run --extra tank."
-        ) from error
-    table = _load(path)
-    if table is None:
-        table, file = fit(fluid, low, high), io.BytesIO()
-        np.savez(file, table=table)
-        with contextlib.suppress(OSError):  # without the file the next process needs a second more
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, file.getvalue())
-    table.flags.writeable = False  # every user of a fluid shares it
-    return table
-
-
-def cache_folder() -> Path:
-    """The folder where fits are kept, in the user's cache."""
-    return user_cache_path("rt_torchrl")
-
-
-def _load(path: Path) -> Float[np.ndarray, "cells 6 5"] | None:
-    """The cached table; None if there is no table, or it cannot be read."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            table = file["table"]
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
-        return None
-    whole = table.shape == (CELLS, DEGREE + 1, len(Properties._fields)) and table.dtype == np.float64
-    return table if whole and np.isfinite(table).all() else None
-
-
-def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
-    """Fit the spline coefficients to CoolProp and compare them with it between the nodes.
+    """Spline coefficients [cell, power, property], which are compared with CoolProp between the nodes.
 
     Raises:
         ValueError: as in :class:`Saturation`, or if the fit misses ``TOLERANCE``.
@@ -174,13 +128,19 @@ def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
             f"the fit of {Properties._fields[error.argmax()]} of {fluid} over {low / 1e3:g} … {high / 1e3:g} kPa errs "
             f"by {error.max():.1e} of its maximum, more than {TOLERANCE:.0e}; narrow the range, above all at its top."
         )
-    return np.stack(powers, 1)
+    table = np.stack(powers, 1)
+    table.flags.writeable = False  # every user of a fluid shares it
+    return table
 
 
 def _open_fluid(fluid: str, low: float, high: float) -> Any:
     """CoolProp's state of a pure fluid, after a check that the range lies between its triple and critical points."""
-    import CoolProp.CoolProp as CP  # here, because it takes a second to load and a cached fit does without
-
+    try:
+        import CoolProp.CoolProp as CP  # here, because it takes a second to load
+    except ImportError as error:
+        raise ValueError(
+            "fluids need CoolProp: install the extra, pip install 'rt_torchrl[tank]', or run uv run --extra tank."
+        ) from error
     try:
         fluid_state = CP.AbstractState("HEOS", fluid)
         pure = CP.get_fluid_param_string(fluid, "pure") == "true"

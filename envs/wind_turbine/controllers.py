@@ -25,7 +25,6 @@ class JonkmanController(ClassicalController):
 
     Args:
         plant: the turbine; its actuators limit the rates.
-        compiled: whether flights are compiled.
 
     Source: Jonkman et al., NREL/TP-500-38060, section 7. Comments name the variables of NREL's ``DISCON.F90``.
     """
@@ -45,8 +44,8 @@ class JonkmanController(ClassicalController):
     power = 5_296_610.0  # P_r at the shaft [W], VS_RtPwr
     constant_power_pitch = 0.01745329  # pitch from which region 3 holds at any speed [rad], VS_Rgn3MP
 
-    def __init__(self, plant: WindTurbine, *, compiled: bool = False):
-        super().__init__(plant, compiled=compiled)
+    def __init__(self, plant: WindTurbine):
+        super().__init__(plant)
         self.alpha = math.exp(-plant.dt * FAST_FILTER)
         self.cut_in_slope = self.torque_gain * self.square_speed**2 / (self.square_speed - self.cut_in_speed)
         self.synchronous_speed = self.constant_power_speed / (1.0 + 0.01 * self.slip)

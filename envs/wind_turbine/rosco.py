@@ -106,7 +106,7 @@ class Answer:
 
     def __init__(self, plant: Plant, start: Tensor, wind: np.ndarray, decide: Decide, every: int):
         self.plant, self.turbine, self.state, self._wind = plant, turbine_of(plant), start.clone(), wind
-        self._decide, self._every, self._step, self._interval = decide, every, 0, steps_of(plant)
+        self._decide, self._every, self._step = decide, every, 0
         computed = ("generator_torque", "blade_pitch", "rotor_speed")
         self._filters = [k for k, signal in enumerate(plant.states) if signal.name not in computed]
 
@@ -120,9 +120,6 @@ class Answer:
         if self._step % self._every == 0:
             k = min(self._step // self._every, len(self._wind) - 1)
             action = self._decide(self.state, float(self._wind[k]), report)
-            if self._step % self._interval == 0:  # as at the start of Plant.step
-                t, wind = self.state.new_tensor(self._step * STEP), self.state.new_tensor([self._wind[k]])
-                self.state = self.plant.memorise(t, self.state, wind)
             self.state = self.plant.latch(self.state, action)
         self._step += 1
         torque, pitch = self.state[4:6].tolist()
@@ -148,7 +145,7 @@ class Answer:
 
 
 def turbine_of(plant: Plant) -> WindTurbine:
-    """The turbine itself, of which policies may observe past observations, too.
+    """The turbine itself.
 
     Raises:
         ValueError: if the plant is no turbine, or has states that no sensor reads.

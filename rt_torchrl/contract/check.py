@@ -13,7 +13,6 @@ from rt_torchrl.contract.gradients_and_tracing import (
     gradients,
     jacobians,
     stability,
-    tracing,
     untraceable,
 )
 from rt_torchrl.contract.methods import Calls, costs, ends, judgement, made, method, periods
@@ -81,16 +80,15 @@ def check_plant(
     visit: signals and their ranges; shapes, precision and finiteness of every method under any leading dimensions;
     purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs,
     also of an early end; a turn of a periodic state, which must change nothing; gradients against finite differences;
-    Jacobians of a batch and one graph, which sensitivities and the compiler need; and the stability of the step. A
-    check is left out if an earlier violation makes it impossible.
+    Jacobians of a batch, which sensitivities need; and the stability of the step. A check is left out if an earlier
+    violation makes it impossible.
 
     Args:
         plant: the plant, with the time step of its training; one on another device is checked by a copy on the CPU.
         episodes: number of flights, at least 2.
         steps: number of control intervals of each flight, at least 2 and at most that of an episode.
         seed: seed of the draws and of the random commands.
-        traced: whether the methods are also traced, into one graph and for the engine ``native``. Tracing takes
-            seconds, and methods that jaxtyping checks at run time cannot become one graph.
+        traced: whether the methods are also traced for the engine ``native``.
         trained: whether a twin of this plant trains its closure, so that each weight must matter on the flights; False
             for a real system whose twin is another plant.
 
@@ -108,13 +106,12 @@ def check_plant(
     if isinstance(plant, type):
         raise ValueError(f"plant={plant.__name__} is a class; give a plant, such as {plant.__name__}().")
     plant, steps = _on_cpu(plant), min(steps, plant.n_steps)
-    checks = {name: check for name, check in ON_FLIGHTS.items() if traced or check is not tracing}
     violations = [*signals(plant)] or [*attempt(draws, plant, seed), *attempt(modules, plant, seed)]
-    violations = violations or _on_flights(plant, episodes, steps, seed, checks.values(), trained=trained)
+    violations = violations or _on_flights(plant, episodes, steps, seed, trained=trained)
     if violations:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), violations)
     reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
-    return ContractReport(plant.name, (*ALWAYS, *checks), episodes, steps, plant.dt, reason)
+    return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, reason)
 
 
 def _on_cpu(plant: Plant) -> Plant:
@@ -123,9 +120,7 @@ def _on_cpu(plant: Plant) -> Plant:
     return plant if all(tensor.device.type == "cpu" for tensor in tensors) else copy.deepcopy(plant).cpu()
 
 
-def _on_flights(
-    plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check], *, trained: bool
-) -> list[str]:
+def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, *, trained: bool) -> list[str]:
     """The violations that need states to be found; an early violation ends the search."""
     calls = Calls.at_the_start(plant, episodes, seed)
     violations = [*attempt(methods, calls), *attempt(stability, calls)]
@@ -137,7 +132,7 @@ def _on_flights(
         return [f"step: {error}"]
     if not trained:
         calls.closure.requires_grad_(False)
-    return [text for check in (*checks, judgement) for text in attempt(check, calls)]
+    return [text for check in (*ON_FLIGHTS.values(), judgement) for text in attempt(check, calls)]
 
 
 def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: Any, name: str = "") -> Iterator[str]:
@@ -215,5 +210,4 @@ ON_FLIGHTS: dict[str, Check] = {
     "stability of the step": stability,
     "gradients": gradients,
     "jacobians": jacobians,
-    "one graph": tracing,
 }

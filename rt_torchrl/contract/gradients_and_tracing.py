@@ -13,7 +13,7 @@ from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.trajectories.engines.code import IntervalCode, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
-from rt_torchrl.trajectories.engines.parallel import as_one_batch, raised_limits
+from rt_torchrl.trajectories.engines.parallel import as_one_batch
 from rt_torchrl.trajectories.twin import jacobians_of
 
 STEP = 1e-6
@@ -26,10 +26,6 @@ SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exoge
 CHECKED = ("vector_field", "step", "running_cost", "terminal_cost", "observe")
 GROWTH = 1.0 + 1e-6
 """Factor per step above which a decaying mode counts as growing; that of an undamped mode is 1 to rounding."""
-TRACEABLE = (
-    "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
-    "throughout"
-)
 
 
 @torch.no_grad()
@@ -236,25 +232,6 @@ def jacobians(calls: Calls) -> Iterator[str]:
         )
 
 
-def tracing(calls: Calls) -> Iterator[str]:
-    """Methods that are not one graph; they are traced without a compiler, so that only the plant can fail."""
-    arguments = calls.some(3)
-    for method in calls.methods():
-
-        def traced(arguments: Arguments, method: Method = method) -> tuple[Tensor, ...]:
-            return method.outputs(arguments)
-
-        try:
-            with raised_limits():
-                found = torch.compile(traced, fullgraph=True, backend="eager")(arguments)
-        except Exception as error:
-            yield f"{method.name}: is not one graph: {first_line(error)} {_where(error)}Expected {TRACEABLE}."
-            continue
-        for name, one, other in zip(method.gives, found, method.outputs(arguments), strict=True):
-            if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
-                yield f"{method.name}: {name} has another value when it is traced; expected {TRACEABLE}."
-
-
 def untraceable(calls: Calls) -> str | None:
     """What keeps the engine ``native`` from the plant under its own policy, with the line of code; None if nothing.
 
@@ -277,13 +254,3 @@ def first_line(error: Exception) -> str:
     """The first line of what an error says, or its kind."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
-
-
-def _where(error: Exception) -> str:
-    """The last line of the user's code that the compiler names."""
-    lines = str(error).splitlines()
-    places = [k for k, line in enumerate(lines) if line.strip().startswith('File "')]
-    if not places:
-        return ""
-    code = lines[places[-1] + 1].strip() if places[-1] + 1 < len(lines) else ""
-    return f"({lines[places[-1]].strip()}: {code}) "

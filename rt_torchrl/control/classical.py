@@ -30,7 +30,6 @@ class ClassicalController(nn.Module, ABC):
     Args:
         plant: the plant to control; its actuators limit range and rate.
         gains: values of the gains, in the order and the units of ``gain_units``; None for the defaults.
-        compiled: whether flights are compiled.
 
     Raises:
         ValueError: if the number of gains is wrong or one of them is not positive and finite.
@@ -45,7 +44,7 @@ class ClassicalController(nn.Module, ABC):
     low_action: Tensor
     high_action: Tensor
 
-    def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None, *, compiled: bool = False):
+    def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None):
         super().__init__()
         values = torch.tensor(self.default_gains if gains is None else gains, dtype=torch.float64)
         if len(values) != len(self.gain_units) or not (values.isfinite() & (values > 0)).all():
@@ -60,7 +59,7 @@ class ClassicalController(nn.Module, ABC):
         low, high = bounds(plant.actions)
         self.register_buffer("low_action", low)
         self.register_buffer("high_action", high)
-        self._engine = Native(compiled=compiled)
+        self._engine = Native()
         self._memory: Tensor | None = None
 
     @property

@@ -2,7 +2,7 @@ r"""The cost of held commands and its exact gradient, and its bounded descent.
 
 .. math::
     J(u) = \frac1N\sum_{k<N}\Big(L_a(t_k, s_k, a_k, z_k)
-        + w\sum_i\Big(\frac{c_{k,i} - a_{k,i}}{h_i - l_i}\Big)^2\Big) + \frac{V(s_N)}{N\Delta t}, \qquad
+        + w\sum_i\Big(\frac{c_{k,i} - a_{k,i}}{h_i - l_i}\Big)^2\Big), \qquad
     c_k = l + (h - l)\,u_{\lfloor k/m\rfloor}
 
 The commands c lie between the ends l and h of their ranges, and each is held for m control intervals. A command beyond
@@ -27,8 +27,6 @@ from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import require_double
 
-TerminalCost = Callable[[Tensor], Tensor]
-"""Function from the end states, ``batch n_s``, to the cost V after the window, ``batch``, in units of L_a·s."""
 Plan = Float[np.ndarray, "m n_a"]
 """Held commands u in [0, 1] of a window."""
 PENALTY = 1.0
@@ -78,16 +76,13 @@ class CommandCost:
         closure: closure of the system.
         n: number N of control intervals of the window.
         hold: number m of control intervals for which a command is held; the last may be held for fewer.
-        terminal: cost V after the window; None for none.
 
     Raises:
         ValueError: if an action has no finite range, episodes of the plant may end early, ``hold`` is
             below 1 or a weight is not in double precision.
     """
 
-    def __init__(
-        self, plant: Plant, closure: nn.Module, n: int, *, hold: int = 1, terminal: TerminalCost | None = None
-    ):
+    def __init__(self, plant: Plant, closure: nn.Module, n: int, *, hold: int = 1):
         require_double("closure", closure)
         low, high = bounds(plant.actions)
         unbounded = [a.name for a, span in zip(plant.actions, (high - low).tolist(), strict=True) if span == torch.inf]
@@ -102,7 +97,7 @@ class CommandCost:
             )
         if hold < 1:
             raise ValueError(f"hold={hold} must be at least 1 control interval.")
-        self.plant, self.n, self.hold, self.terminal = plant, n, hold, terminal
+        self.plant, self.n, self.hold = plant, n, hold
         self.interval = PenalisedInterval(plant, closure)
         self._low, self._span = low.numpy(), (high - low).numpy()
         self._first = np.arange(0, n, hold)
@@ -154,32 +149,17 @@ class CommandCost:
         self._march()
         self._costate[:] = 0.0
         self._costate[-1] = 1.0
-        cost = self._states[-1, -1, 0]
-        if self.terminal is not None:
-            cost += self._end(self.terminal)
         self._sweep()
         by_plan = np.add.reduceat(self._by_drive[:, -n_a:, 0], self._first, 0)
-        return float(cost) / self.n, by_plan / self.n
-
-    def _end(self, terminal: TerminalCost) -> float:
-        """V/Δt of the end state, whose gradient goes into the co-state."""
-        with torch.enable_grad():
-            end = torch.from_numpy(self._states[-1, :-1, :1].T.copy()).requires_grad_()
-            value = terminal(end).sum() / self.plant.dt
-            # The terminal cost of most plants is a constant.
-            slope = torch.autograd.grad(value, end)[0] if value.requires_grad else torch.zeros_like(end)
-        self._costate[:-1] = slope.numpy().T
-        return value.item()
+        return float(self._states[-1, -1, 0]) / self.n, by_plan / self.n
 
     def _by_torch(self, plan: Plan) -> tuple[float, Plan]:
         """The same for a plant that cannot become machine code."""
         with torch.enable_grad():
             u = torch.from_numpy(plan).clone().requires_grad_()
             command = u.repeat_interleave(self.hold, 0)[: self.n].unsqueeze(1)
-            ends = Native(compiled=False).end_states(self.interval, self._state, self._drive._replace(command=command))
+            ends = Native().end_states(self.interval, self._state, self._drive._replace(command=command))
             cost = ends[-1, 0, -1]
-            if self.terminal is not None:
-                cost = cost + self.terminal(ends[-1, :, :-1]).sum() / self.plant.dt
             (slope,) = torch.autograd.grad(cost, u)
         return cost.item() / self.n, slope.numpy() / self.n
 

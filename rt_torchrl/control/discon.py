@@ -39,10 +39,10 @@ class DISCON(ClassicalController):
 
     A library keeps its memory in global variables, so that one process holds one controller for each file. Each
     episode therefore loads a copy of the file, which is unloaded when the next episodes begin. What the copies need,
-    such as the Fortran runtime, they share. The controller is no function of state and memory: no flight is compiled,
-    and none takes gradients. A library is code that runs in this process; load only what you trust.
+    such as the Fortran runtime, they share. The controller is no function of state and memory, so that no flight
+    takes gradients. A library is code that runs in this process; load only what you trust.
 
-    A training takes a subclass whose ``__init__(plant, *, compiled)`` names the files.
+    A training takes a subclass whose ``__init__(plant)`` names the files.
 
     Args:
         plant: a turbine with the states rotor_speed, generator_torque and blade_pitch [deg], the input wind_speed, and

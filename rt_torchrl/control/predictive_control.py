@@ -1,7 +1,6 @@
 """Model predictive control: the best commands over a horizon by bounded descent, planned again every period."""
 
 import copy
-import dataclasses
 import itertools
 import math
 import statistics
@@ -10,13 +9,12 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import CommandCost, Plan, TerminalCost, descend
+from rt_torchrl.control.command_cost import CommandCost, Plan, descend
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.options import AtLeastOne, Limit, NotNegative, Positive, configuration
+from rt_torchrl.options import AtLeastOne, NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, State
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -35,7 +33,6 @@ class PredictiveConfig:
         hold: time for which a command is held [s]; None for the plant's control interval.
         iterations: greatest number of iterations of L-BFGS-B in a solve.
         tolerance: relative decrease of the cost in an iteration below which a solve ends.
-        deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
         forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, or
             decaying to the mean of the inputs met so far with the time that fits them best; until inputs have been met,
             they are held.
@@ -49,7 +46,6 @@ class PredictiveConfig:
     hold: Positive | None = None
     iterations: AtLeastOne = 20
     tolerance: NotNegative = 1e-4
-    deadline: Limit = math.inf
     forecast: Literal["held", "decaying"] = "decaying"
     virtual_episodes: ClassVar[int] = 3
     """Number of virtual episodes in each of the steps 5 and 6; each takes as long as all solves of a real episode."""
@@ -67,34 +63,26 @@ class Solve(NamedTuple):
 
     Args:
         seconds: wall-clock time [s].
-        late: whether the deadline passed, so that the last plan went on.
         diverged: whether the model diverged under the last plan, so that this or a constant command went on.
     """
 
     seconds: float
-    late: bool
-    diverged: bool = False
-
-
-class _LateError(Exception):
-    """The deadline of a solve has passed."""
+    diverged: bool
 
 
 class RecedingHorizon:
     r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
 
-    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
+    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' \quad\text{from the measured state, under a forecast of z}
 
-    Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
-    best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
-    the episode begins, so that the first solve has a deadline too.
+    Every plan starts from the rest of the last one, whose end is held; the first plan of an episode starts from the
+    best constant command.
 
     Args:
         plant: the physics of the model.
         closure: closure of the model; a twin's closure may be trained while the controller acts.
         config: parameters.
         forecast: forecast of the exogenous inputs; None holds what is measured.
-        terminal: cost V after the horizon, a function of the end states, in units of L_a·s; None for none.
 
     Raises:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
@@ -107,7 +95,6 @@ class RecedingHorizon:
         config: PredictiveConfig,
         *,
         forecast: Forecast | None = None,
-        terminal: TerminalCost | None = None,
     ):
         self.plant, self.config = plant, config
         self.forecast: Forecast = forecast or Held()
@@ -116,8 +103,7 @@ class RecedingHorizon:
         self.period = hold if config.period is None else self._whole("period", config.period, hold)
         if self.period > self.horizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.length(plant)} s.")
-        self.cost = CommandCost(plant, constant(closure), self.horizon, hold=hold, terminal=terminal)
-        self._prepared: Plan | None = None
+        self.cost = CommandCost(plant, constant(closure), self.horizon, hold=hold)
         self.solves: list[Solve] = []
         self.begin()
 
@@ -130,27 +116,9 @@ class RecedingHorizon:
         return count * multiple
 
     def begin(self) -> None:
-        """Begin new episodes; what :meth:`prepare` has planned stays."""
+        """Begin new episodes."""
         self._plans: list[Plan] = []
         self._commands: Tensor | None = None
-
-    def prepare(self, state: Float[Tensor, "1 n_s"], exogenous: Float[Tensor, "1 n_z"]) -> None:
-        """Plan before episodes begin, so that their first solves have a plan to go on with when they are late.
-
-        The plan is one more start of the first solves. The first call also makes the machine code, which takes seconds.
-
-        Args:
-            state: state that is typical of the beginning of an episode.
-            exogenous: typical measured inputs.
-
-        Raises:
-            DivergenceError: if the model diverges under every constant command.
-        """
-        self._prepared = None
-        self.begin()
-        self.plan(0.0, state, exogenous)
-        self._prepared = self._plans[0]
-        self.begin()
 
     def plan(self, t: float, state: State, exogenous: Input) -> Actions:
         """Plan anew and return the commands of the whole window.
@@ -168,33 +136,22 @@ class RecedingHorizon:
             safe_point()
             began = time.perf_counter()
             self.cost.begin(state[episode], coming, start=t)
-            last = self._prepared if first else self._shifted(self._plans[episode])
-            starts = ([] if last is None else [last]) + (self._constants() if first else [])
-            start = starts[0] if len(starts) == 1 else self._cheapest(starts)
-            found.append(self._solved(start, last, began))
+            last = None if first else self._shifted(self._plans[episode])
+            found.append(self._solved(last, began))
         self._plans = found
         return torch.stack([self.cost.commands(plan) for plan in found])
 
-    def _solved(self, start: Plan, last: Plan | None, began: float) -> Plan:
-        """The plan of an episode; if it is late or diverges, the last one goes on, if there is one."""
-        config, deadline = self.config, math.inf if last is None else self.config.deadline
-
-        def evaluate(plan: Plan) -> tuple[float, Plan]:
-            if time.perf_counter() - began > deadline:
-                raise _LateError
-            return self.cost(plan)
-
-        late = diverged = False
+    def _solved(self, last: Plan | None, began: float) -> Plan:
+        """The plan of an episode; where the model diverges under the last plan, this or a constant command goes on."""
+        start, config = self._cheapest(self._constants()) if last is None else last, self.config
+        diverged = False
         try:
-            found = descend(evaluate, start, iterations=config.iterations, tolerance=config.tolerance).point
-        except _LateError:
-            found, late = start, True
+            found = descend(self.cost, start, iterations=config.iterations, tolerance=config.tolerance).point
         except FloatingPointError as error:
             if last is None:
                 raise DivergenceError(f"plant {self.plant.name!r} diverges in every first plan: {error}") from error
-            # A constant command goes on where the model diverges under the last plan too.
             found, diverged = self._cheapest([last, *self._constants()]), True
-        self.solves.append(Solve(time.perf_counter() - began, late, diverged))
+        self.solves.append(Solve(time.perf_counter() - began, diverged))
         return found
 
     def _shifted(self, plan: Plan) -> Plan:
@@ -250,8 +207,8 @@ class PredictiveControl(nn.Module):
     """State feedback by :class:`RecedingHorizon`; see :class:`StateFeedback` for the methods.
 
     Its weights are those of the closure that it plans on, and it has no others; its buffers are those of its forecast.
-    Before every episode it plans once from a typical state, which is a draw of the plant, so that the first solve has a
-    plan to go on with when it is late. Only :meth:`act` has the deadline: a simulated episode knows no wall clock.
+    Before every episode it plans once from a typical state, which is a draw of the plant: the first plan also makes the
+    machine code, which takes seconds.
 
     Args:
         plant: the physics of the model.
@@ -272,10 +229,7 @@ class PredictiveControl(nn.Module):
         if config.forecast == "decaying":
             forever = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
             self.forecast = Decaying(torch.zeros_like(forever), forever, dt=plant.dt)  # which holds, too
-        timeless = dataclasses.replace(config, deadline=math.inf)
-        self._acting, self._virtual = (
-            RecedingHorizon(plant, closure, chosen, forecast=self.forecast) for chosen in (config, timeless)
-        )
+        self._acting = RecedingHorizon(plant, closure, config, forecast=self.forecast)
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
 
@@ -302,7 +256,9 @@ class PredictiveControl(nn.Module):
         return self._acting.solves
 
     def begin(self) -> None:
-        self._acting.prepare(*self._typical)
+        self._acting.begin()
+        self._acting.plan(0.0, *self._typical)
+        self._acting.begin()
         self._acting.solves.clear()
 
     @torch.no_grad()
@@ -313,18 +269,16 @@ class PredictiveControl(nn.Module):
     def fly(
         self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
-        self._virtual.prepare(*self._typical)
-        flown = self._virtual.fly(initial_state, exogenous, closure, plant=plant)
-        self._virtual.solves.clear()
-        return flown
+        # Beside the controller that acts, which may be in the middle of an episode.
+        beside = RecedingHorizon(self._acting.plant, self.closure, self._acting.config, forecast=self.forecast)
+        return beside.fly(initial_state, exogenous, closure, plant=plant)
 
     def report(self) -> dict[str, float]:
-        """Wall-clock times of the solves [ms], and the numbers of those that were late or diverged."""
+        """Wall-clock times of the solves [ms], and the number of those that diverged."""
         seconds = [solve.seconds for solve in self.solves]
         return {
             "solve_median": 1e3 * statistics.median(seconds),
             "solve_max": 1e3 * max(seconds),
-            "late_solves": float(sum(solve.late for solve in self.solves)),
             "diverged_solves": float(sum(solve.diverged for solve in self.solves)),
         }
 

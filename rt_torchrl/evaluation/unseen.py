@@ -36,10 +36,9 @@ class RealController(nn.Module, ABC):
 
     Args:
         plant: physics and control problem of the twin.
-        compiled: compile what can be.
     """
 
-    def __init__(self, plant: Plant, *, compiled: bool = False):
+    def __init__(self, plant: Plant):
         super().__init__()
         self.plant = plant
 
@@ -62,7 +61,6 @@ class UnseenEpisodes:
     Args:
         plant: the real system in simulation.
         count: number of episodes, at least 2.
-        compiled: whether to compile the rollouts.
         device: device on which the rollouts run.
         seed: seed of the draws of initial states and disturbances.
     """
@@ -75,14 +73,13 @@ class UnseenEpisodes:
         plant: Plant,
         count: int = 20,
         *,
-        compiled: bool = False,
         device: torch.device | str = "cpu",
         seed: int = UNSEEN_SEED,
     ):
         if count < 2:
             raise ValueError(f"count={count} of unseen episodes must be at least 2 for a confidence interval.")
         generator = torch.Generator(device=device).manual_seed(seed)
-        self.plant, self._compiled = plant, compiled
+        self.plant = plant
         self.closure: nn.Module | None = plant.closure
         self.physics = plant
         self.bounds: StateBounds | None = None
@@ -125,7 +122,7 @@ class UnseenEpisodes:
 
     def rollout(self, policy: nn.Module) -> Rollout:
         """The closed loop of a policy and the real system."""
-        return Rollout(self.plant, self.known_closure(), policy, compiled=self._compiled)
+        return Rollout(self.plant, self.known_closure(), policy)
 
     def known_closure(self) -> nn.Module:
         """The true closure.
@@ -155,7 +152,7 @@ class UnseenEpisodes:
         if self.closure is None:
             return None
         count, device = self.initial_state.shape[0], self.initial_state.device
-        found = UnseenEpisodes(self.plant, count, compiled=self._compiled, device=device, seed=VALIDATION_SEED)
+        found = UnseenEpisodes(self.plant, count, device=device, seed=VALIDATION_SEED)
         found.closure = self.closure
         return found
 
@@ -183,7 +180,7 @@ class UnseenEpisodes:
             segment: number of control intervals of the segments over which J_p is the mean, as in step 4; 0 for whole
                 episodes.
         """
-        rollout = Rollout(physics, closure, compiled=self._compiled)
+        rollout = Rollout(physics, closure)
         episodes = len(flown.states)
         flown = flown.segments(segment, physics.dt) if segment else flown
         measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])

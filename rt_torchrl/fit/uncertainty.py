@@ -14,8 +14,8 @@ and noise that differs between samples:
 Residuals are orthogonal to their derivatives, so that M of a short record is too small: it is multiplied by n/(n − p),
 for n samples and p unknowns, and no combination of the unknowns is told better than by white noise of their size.
 
-Named values of the closure, and points of its curve, take their errors from those of the weights to first order. Both
-formulas assume that the physics is right: an error that no weights can remove is bias, and no record shows its size.
+Named values of the closure take their errors from those of the weights to first order. Both formulas assume that the
+physics is right: an error that no weights can remove is bias, and no record shows its size.
 
 Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
 """
@@ -31,7 +31,6 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
 from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.trajectories.engines.interval import batched
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
@@ -258,47 +257,3 @@ def named_values(closure: nn.Module) -> dict[str, Tensor]:
         if weight.requires_grad
         for place in np.ndindex(*weight.shape)
     }
-
-
-class Band(NamedTuple):
-    """A curve and its pointwise interval at the abscissae x."""
-
-    x: Float[Tensor, " points"]
-    middle: Float[Tensor, " points"]
-    low: Float[Tensor, " points"]
-    high: Float[Tensor, " points"]
-
-
-def band(
-    uncertainty: Uncertainty,
-    x: Float[Tensor, " points"],
-    features: Float[Tensor, "points n_f"],
-    *,
-    output: int = 0,
-    level: float = 0.95,
-) -> Band:
-    """The interval of one output of the estimated closure along a line of features; without end where data say nothing.
-
-    Args:
-        uncertainty: uncertainty of the estimate.
-        x: abscissae, one for each point.
-        features: features of the closure at these points.
-        output: number of the closure's output.
-        level: probability of each point's interval.
-
-    Raises:
-        ValueError: if the level does not lie between 0 and 1.
-    """
-    closure = uncertainty.likelihood.twin.closure
-    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
-
-    def value(weights: dict[str, Tensor], point: Tensor) -> Tensor:
-        outputs: Tensor = torch.func.functional_call(closure, weights, (point,))
-        return outputs[..., output]
-
-    slopes = batched(torch.func.jacrev(value), in_dims=(None, 0))(trained, features)
-    J = torch.cat([slope.flatten(1) for slope in slopes.values()], -1)
-    variance = ((J @ uncertainty.weights_covariance) * J).sum(-1)
-    deviation = torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
-    half, middle = normal_factor(level) * deviation, value(trained, features).detach()
-    return Band(x, middle, middle - half, middle + half)

@@ -47,7 +47,6 @@ TAGS = {
     "ended_after": "cost/control intervals until the early end of the real episode",
     "solve_median": "predictive control/median time of a solve (ms)",
     "solve_max": "predictive control/longest solve (ms)",
-    "late_solves": "predictive control/late solves",
     "diverged_solves": "predictive control/solves whose model diverged",
     "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
     "alarm": "twin/alarm: the twin is wrong where it matters",

@@ -66,12 +66,7 @@ class Resting:
 
 
 def simulated(
-    plant: Plant,
-    config: RunConfig,
-    first: type[ClassicalController] | None,
-    *,
-    device: torch.device,
-    compiled: bool,
+    plant: Plant, config: RunConfig, first: type[ClassicalController] | None, *, device: torch.device
 ) -> EnvBase:
     """The real system in simulation, with the sensors and the wear of the configuration.
 
@@ -79,11 +74,11 @@ def simulated(
     rest.
     """
     wear = config.wear(plant)
-    env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, noise=config.noise, wear=wear)
+    env = PlantEnv(plant, seed=config.seed, device=device, noise=config.noise, wear=wear)
     if not config.twinning.limits:
         return env
     limits = OperatingLimits(plant, config.twinning.limits)
-    controller = None if first is None else first(plant, compiled=compiled).to(device)
+    controller = None if first is None else first(plant).to(device)
     zero = env.action_spec.zero()
     low, high = (zero.new_tensor(end) for end in limits.actions)
     rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
@@ -92,14 +87,14 @@ def simulated(
 
 
 def judged_on(
-    plant: Plant, twin: DigitalTwin, env: RealSystem | None, config: RunConfig, *, device: torch.device, compiled: bool
+    plant: Plant, twin: DigitalTwin, env: RealSystem | None, config: RunConfig, *, device: torch.device
 ) -> UnseenEpisodes:
     """The unseen episodes, for which no real system moves: on the plant, or on the twin if nobody knows the closure.
 
     Policies for them are made for the physics that the twin knows, and leaving the bounds of states counts.
     """
     if env is None or env.closure is not None:
-        unseen = UnseenEpisodes(plant, config.unseen, compiled=compiled, device=device)
+        unseen = UnseenEpisodes(plant, config.unseen, device=device)
         unseen.judged_on = "simulation" if env is None else "simulation of the real system"
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)

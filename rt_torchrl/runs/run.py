@@ -45,7 +45,6 @@ from rt_torchrl.steps.switch import MakeReferee, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.preflight import check_record
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -133,8 +132,6 @@ class Run:
         self.ended: str | None = None
         self.callbacks = callbacks
         device = require_device(config.device)
-        native = config.engine == "native" and device.type == "cpu"  # which compiles by itself
-        compiled = not native and can_compile(device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
         physics = known_physics(config, plant, believed, real, first, baselines).to(device)
@@ -148,13 +145,13 @@ class Run:
         self.folder = self._held.path
         try:
             if real is None:
-                make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
-            system = real or simulated(plant, config, first, device=device, compiled=compiled)
+                make_env = functools.partial(simulated, plant, config, first, device=device)
+            system = real or simulated(plant, config, first, device=device)
             makers = (learner or functools.partial(ActorCritic, replay=replay), planner, referee, collector)
-            self._make_algorithm(system, make_env, physics, *makers, device=device, compiled=compiled)
-            self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
+            self._make_algorithm(system, make_env, physics, *makers, device=device)
+            self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device)
             self._real, self._device = real, device
-            made = {name: law(physics, compiled=compiled) for name, law in laws.items()}
+            made = {name: law(physics) for name, law in laws.items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
@@ -179,7 +176,6 @@ class Run:
         collector: MakeCollector,
         *,
         device: torch.device,
-        compiled: bool,
     ) -> None:
         config = self.config
         generator = torch.Generator(device=device).manual_seed(config.seed)
@@ -188,7 +184,7 @@ class Run:
         closure = config.make_closure(physics, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
-        table, twin = config.twinning, twin_of(config, physics, closure, first, compiled=compiled)
+        table, twin = config.twinning, twin_of(config, physics, closure, first)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         self.algorithm = ReinforcementTwinning(
             operation_of(config, env, make_env, physics, policies, first=first) if config.asynchronous else env,
@@ -408,11 +404,3 @@ class Run:
 
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
-
-
-def can_compile(device: torch.device) -> bool:
-    """Whether this machine has what torch.compile needs; if not, the terminal shows what is missing."""
-    missing = missing_for_compilation() if device.type == "cpu" else None
-    if missing:
-        print(f"This machine lacks {missing}: running without torch.compile, several times slower.")
-    return missing is None

@@ -72,11 +72,9 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     )
 
 
-def twin_of(
-    config: RunConfig, physics: Plant, closure: nn.Module, first: Start | None, *, compiled: bool
-) -> DigitalTwin:
+def twin_of(config: RunConfig, physics: Plant, closure: nn.Module, first: Start | None) -> DigitalTwin:
     """The twin of a run, with the hypotheses of an earlier one that it begins with."""
-    twin = make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled)
+    twin = make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine)
     if isinstance(first, EarlierPolicies):
         first.hand_over(twin)
     return twin

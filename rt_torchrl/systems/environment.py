@@ -11,9 +11,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from rt_torchrl.options import OTHER_UNITS, require_number
-from rt_torchrl.plants.plant import Plant, Transition, with_memories
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.trajectories.engines.parallel import compiled_if
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
 
@@ -21,8 +20,8 @@ from rt_torchrl.trajectories.trajectory import Scenario
 class PlantEnv(EnvBase):
     r"""A plant with its true closure, stepped by commands.
 
-    The algorithm flies this class by a compiled scan. It flies a subclass, which may override a step, step by step, and
-    that is ten times slower.
+    The algorithm flies this class by machine code. It flies a subclass, which may override a step, step by step, and
+    that is far slower.
 
     The TensorDict has these entries, each with the batch size (1,) in front:
 
@@ -40,11 +39,9 @@ class PlantEnv(EnvBase):
         plant: the plant; its own closure is the true one.
         seed: seed of the generator that draws initial states and exogenous inputs.
         device: device on which the environment runs.
-        compiled: whether to compile the step.
         noise: standard deviation of the sensors' error as a share of the value that they read. Every reported state is
             s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
-            the true state. What a controller memorises (:attr:`Plant.memories`) is what was measured then, and gets no
-            further noise.
+            the true state.
         wear: function from the number of an episode, counted from 0, to the real system's closure in it; with None the
             plant's own closure holds in all episodes.
 
@@ -58,7 +55,6 @@ class PlantEnv(EnvBase):
         *,
         seed: int = 0,
         device: torch.device | str = "cpu",
-        compiled: bool = False,
         noise: float = 0.0,
         wear: Callable[[int], nn.Module] | None = None,
     ):
@@ -68,12 +64,11 @@ class PlantEnv(EnvBase):
             raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
         super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
         self.plant = plant.to(device)
-        self._transition = compiled_if(compiled, _transition)
         self._generator = torch.Generator(device=device)
         # The sensors have their own generator, so that sensors of any quality see the same disturbances.
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
-        self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
+        self._noise, self._wear, self._episodes = noise, wear, 0
         declare_specs(self, plant)
 
     @property
@@ -138,15 +133,14 @@ class PlantEnv(EnvBase):
             self._closure = self.begin_episode()
         t, exogenous = self._now()
         command = tensordict["action"]
-        transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
+        transition = self.plant.step(t, self._state, command, exogenous, self._closure)
+        cost = self.plant.running_cost(t, self._state, transition.applied, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
             raise DivergenceError(
                 f"plant {self.plant.name!r} diverged at t = {t.item():g} s: state {self._state.tolist()}, "
                 f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
             )
-        # A compiled step may reuse its output buffer.
-        measured = self._state * self._factor
-        self._state = with_memories(self.plant, transition.state.clone(), t, measured, exogenous)
+        self._state = transition.state
         self._step_count += 1
         over = torch.full((1, 1), self._step_count >= self.plant.n_steps, device=self.device)
         ends = self.plant.end_cost is not None
@@ -177,9 +171,7 @@ class PlantEnv(EnvBase):
         shape, like = (1, len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
-        drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
-        read = [signal.name not in self.plant.memories for signal in self.plant.states]
-        return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
+        return 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
 
     def _now(self) -> tuple[Float[Tensor, " 1"], Float[Tensor, "1 n_z"]]:
         """Time and exogenous input of this interval; after the last interval, the input is that of the last one."""
@@ -256,13 +248,6 @@ def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
         f"ended(state) and end_cost; or use a horizon of at most {count * plant.dt:g} s, or an environment that goes "
         "on."
     )
-
-
-def _transition(
-    plant: Plant, closure: nn.Module, t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor
-) -> tuple[Transition, Tensor]:
-    transition = plant.step(t, state, command, exogenous, closure)
-    return transition, plant.running_cost(t, state, transition.applied, exogenous)
 
 
 class AroundSystem(EnvBase):

@@ -55,7 +55,6 @@ class Rollout:
         closure: the plant's own closure for the real system, a learned one for its twin.
         policy: policy that computes the command of each interval; None if each call passes the commands.
         engine: name of the engine that computes gradients with respect to weights, initial state and drive.
-        compiled: compile with torch.compile what the engine leaves to torch; eager is quicker for short horizons.
 
     Raises:
         ValueError: if the engine does not exist, cannot follow the plant's own scheme, or a module is not in double
@@ -69,7 +68,6 @@ class Rollout:
         policy: nn.Module | None = None,
         *,
         engine: Engine = "native",
-        compiled: bool = False,
     ):
         refused = refusal(engine, plant)
         if refused:
@@ -80,7 +78,7 @@ class Rollout:
         self.interval = Interval(plant, closure, policy)
         self._costed = CostInterval(self.interval)
         self.engine = engine
-        self._engine = ENGINES[engine](compiled=compiled)
+        self._engine = ENGINES[engine]()
 
     def __call__(
         self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0

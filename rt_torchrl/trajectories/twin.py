@@ -53,16 +53,15 @@ class DigitalTwin:
         plant: the physics, which a simulated real system shares; the plant's own closure is never used here.
         closure: the learned closure g(·; w_p).
         engine: gradient engine, see :mod:`rt_torchrl.trajectories.rollout`.
-        compiled: compile the engine.
 
     Raises:
         ValueError: if episodes of the plant end early at no cost.
     """
 
-    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "native", compiled: bool = False):
+    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "native"):
         require_end_cost(plant)
         self.plant, self.closure = plant, closure
-        self._engine, self._compiled = engine, compiled
+        self._engine = engine
         self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure)
         self._planned: list[_Planned] = []
@@ -71,10 +70,10 @@ class DigitalTwin:
 
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
-        return DigitalTwin(plant, self.closure, engine=able(self._engine, plant), compiled=self._compiled)
+        return DigitalTwin(plant, self.closure, engine=able(self._engine, plant))
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
-        return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
+        return Rollout(self.plant, closure, policy, engine=self._engine)
 
     def replay(self, initial_state: Starts, exogenous: Inputs, actions: Actions, *, start: Start = 0.0) -> Trajectory:
         """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
@@ -118,7 +117,7 @@ class DigitalTwin:
         # Kept, because the engine compares what is new to it with all that it knows, which takes milliseconds.
         if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
             self._read = ReadInterval(self.plant, self.closure, None)
-        ends = Native(compiled=False).end_states(self._read, start, drive)
+        ends = Native().end_states(self._read, start, drive)
         require_finite(self.plant, ends, start, [self.closure])
         return torch.cat([start, ends[:, 0]])
 
@@ -289,7 +288,7 @@ class Sensitivities:
     def __init__(self, plant: Plant, closure: nn.Module):
         self.interval = Interval(plant, closure, None)
         self._tangent = TangentInterval(self.interval, self._trained())
-        self._engine = Native(compiled=False)
+        self._engine = Native()
 
     @torch.no_grad()
     def __call__(

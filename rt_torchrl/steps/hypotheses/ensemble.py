@@ -34,7 +34,7 @@ class TwinEnsemble(DigitalTwin):
         closure: its closure.
         suspects: plants that extend ``plant``, by name.
         closures: closures of these plants, by name.
-        engine, compiled: see :class:`DigitalTwin`; a hypothesis that the engine cannot roll out has ``autograd``.
+        engine: see :class:`DigitalTwin`; a hypothesis that the engine cannot roll out has ``autograd``.
 
     Raises:
         ValueError: if a plant has no closure, or does not extend the twin's plant.
@@ -48,9 +48,8 @@ class TwinEnsemble(DigitalTwin):
         closures: Mapping[str, nn.Module],
         *,
         engine: Engine = "native",
-        compiled: bool = False,
     ):
-        super().__init__(plant, closure, engine=engine, compiled=compiled)
+        super().__init__(plant, closure, engine=engine)
         if suspects.keys() != closures.keys():
             raise ValueError(f"suspects {quoted(suspects)} and closures {quoted(closures)} must have equal names.")
         for name, suspect in suspects.items():
@@ -58,10 +57,9 @@ class TwinEnsemble(DigitalTwin):
                 raise ValueError(
                     f"hypothesis {name!r} must extend the twin's plant {plant.name!r}: other states are read."
                 )
-        self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine, compiled=compiled)}
+        self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine)}
         for name, suspect in suspects.items():
-            taken = able(engine, suspect)  # without compilation if it is another one, as everywhere
-            self.twins[name] = DigitalTwin(suspect, closures[name], engine=taken, compiled=compiled and taken == engine)
+            self.twins[name] = DigitalTwin(suspect, closures[name], engine=able(engine, suspect))
         self.weights = {ALONE: 1.0}
 
     @property
@@ -150,14 +148,7 @@ class TwinEnsemble(DigitalTwin):
         return each.new_tensor(list(self._shares.values())) @ each
 
 
-def make_twin(
-    plant: Plant,
-    closure: nn.Module,
-    config: HypothesesConfig,
-    *,
-    engine: Engine = "native",
-    compiled: bool = False,
-) -> DigitalTwin:
+def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, engine: Engine = "native") -> DigitalTwin:
     """The twin of a plant, with the hypotheses that a configuration asks for.
 
     Each hypothesis begins with a copy of the closure.
@@ -176,10 +167,10 @@ def make_twin(
             )
         taken = {name: suspect for name, suspect in known.items() if name in config.which}
     if not taken:
-        return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
+        return DigitalTwin(plant, closure, engine=engine)
     device = next((w.device for w in closure.parameters()), torch.device("cpu"))
     closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
-    return TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
+    return TwinEnsemble(plant, closure, taken, closures, engine=engine)
 
 
 def extended(suspect: Plant, closure: nn.Module) -> nn.Module:

@@ -22,7 +22,7 @@ from rt_torchrl.programs.machine_code import Lanes, ObjectCode, lanes_of_this_ma
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.programs.tracer import STRAIGHT, Tracer
-from rt_torchrl.trajectories.engines.interval import Drive, with_weights
+from rt_torchrl.trajectories.engines.interval import Drive, costate_products, with_weights
 
 X = (ctypes.c_void_p, *[ctypes.c_int64] * 3)
 MARCH = (*X, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
@@ -252,7 +252,7 @@ class IntervalCode:
         parts = [state], [*drive] if driven else [], learned
         leaves = [leaf.requires_grad_() for part in parts for leaf in part]
         with torch.enable_grad(), tracer.following():
-            gradients = _gradients(with_weights(interval, weights, state, drive), leaves, costate)
+            gradients = costate_products(with_weights(interval, weights, state, drive), leaves, costate)
         values = map(tracer.outputs, gradients)
         outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
         code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
@@ -295,15 +295,8 @@ class IntervalCode:
         with torch.enable_grad(), self._executed.noted():
             end = interval(leaves[0], Drive(*leaves[1:]))
             given = torch.from_numpy(costate.T)[rows]
-            state, t, *rest = _gradients(end, [*leaves, *inputs.learned], given)
+            state, t, *rest = costate_products(end, [*leaves, *inputs.learned], given)
         return [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
-
-
-def _gradients(end: Tensor, leaves: list[Tensor], costate: Tensor) -> Sequence[Tensor]:
-    """The products of the co-state of an end with its Jacobians by the leaves."""
-    if not end.requires_grad:
-        return [torch.zeros_like(leaf) for leaf in leaves]
-    return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
 
 
 def require_equal(what: str, computed: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:

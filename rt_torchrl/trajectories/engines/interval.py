@@ -1,6 +1,6 @@
 """One control interval as a differentiable map, what engines do with it, and the two plain engines of PyTorch."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -111,6 +111,13 @@ def batched(jacobian: Callable[..., Any], in_dims: int | tuple[int | None, ...] 
     return of_all
 
 
+def costate_products(end: Tensor, leaves: Sequence[Tensor], costate: Tensor) -> Sequence[Tensor]:
+    """λᵀ∂Φ/∂x for each leaf x of an end state Φ, zero for those on which it does not depend."""
+    if not end.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
+    return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
+
+
 def march(interval: Callable[[Tensor, Drive], Tensor], initial_state: Tensor, drive: Drive) -> Tensor:
     """States at the end of every interval, ``n batch n_s``, by a loop."""
     state, states = initial_state, []
@@ -124,17 +131,11 @@ class GradientEngine:
     """Computes differentiable trajectories of a plant.
 
     The options name an engine by its class, in small letters and with underscores.
-
-    Args:
-        compiled: compile by PyTorch what the engine leaves to it; without effect on most engines.
     """
 
     exact: ClassVar[bool] = True
     """Whether the engine differentiates the plant's own step. One that integrates the vector field takes no plant with
     another scheme (:attr:`Plant.own_scheme`) or with early ends."""
-
-    def __init__(self, *, compiled: bool = False):
-        pass
 
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable by weights, initial state and drive."""
@@ -162,8 +163,7 @@ class OdeintAdjoint(GradientEngine):
     integrated state, so that each realisation may have a start of its own. The co-state of an action is then
     :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, and ordinary backpropagation carries it on
     into the policy. The co-state is integrated backwards with the step of the forward solution, so that the gradient
-    differs from the exact one of the discrete trajectory by the order of that step. Nothing is compiled: torchdiffeq
-    goes back several times through one graph, which compiled code refuses.
+    differs from the exact one of the discrete trajectory by the order of that step.
     """
 
     exact: ClassVar[bool] = False

@@ -11,7 +11,6 @@ which computes each interval again from its start. The lanes of the processor's 
 lanes are divided among the threads of torch.
 """
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,23 +37,13 @@ class Native(GradientEngine):
     Where an interval cannot become a program, the engine ``autograd`` takes its place without compilation, with one
     warning for each kind of interval: it executes any code as it is written. The engine ``parallel`` evaluates many
     intervals at once, so that a Python branch could be another one; it serves other devices than the CPU alone.
-
-    Args:
-        compiled: whether the engine for other devices compiles.
     """
-
-    def __init__(self, *, compiled: bool = False):
-        self._compiled = compiled
-
-    @cached_property
-    def _elsewhere(self) -> Parallel:
-        return Parallel(compiled=self._compiled)
 
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         if initial_state.device.type != "cpu":
             require_pure_once(interval, initial_state, drive)
-            return self._elsewhere.end_states(interval, initial_state, drive)
+            return Parallel().end_states(interval, initial_state, drive)
         found = self.own_end_states(interval, initial_state, drive)
         return Autograd().end_states(interval, initial_state, drive) if found is None else found
 
