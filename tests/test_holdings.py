@@ -4,12 +4,9 @@ import copy
 import ctypes
 import functools
 import gc
-import hashlib
 import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 
-import fresh_process
 import numpy as np
 import pytest
 import torch
@@ -17,7 +14,7 @@ from torch import nn
 
 from rt_torchrl.programs import machine_code
 from rt_torchrl.programs.contract import Holdings
-from rt_torchrl.programs.machine_code import DIGEST, ObjectCode
+from rt_torchrl.programs.machine_code import ObjectCode
 
 
 class Plain:
@@ -194,36 +191,6 @@ def test_code_can_be_freed_and_other_code_stays():
     del second
     gc.collect()
     assert [stored(1.0, first), stored(3.0, third), stored(4.0)] == [1.0, 3.0, 4.0]
-
-
-SECOND = """
-import ctypes, sys
-from pathlib import Path
-import numpy as np
-from rt_torchrl.programs import machine_code
-
-machine_code.cache_folder = lambda: Path(sys.argv[1])
-if sys.argv[2] == "reads":
-    machine_code._compile = None
-code, found = machine_code.ObjectCode(sys.argv[3], "put", (ctypes.c_void_p,)), np.zeros(1)
-code(found)
-print(found[0])
-"""
-
-
-def second(*arguments):
-    return fresh_process.run(SECOND, *map(str, arguments))
-
-
-def test_other_processes_write_at_once_and_load_what_is_kept(folder, compilations):
-    with ThreadPoolExecutor(2) as pool:
-        done = list(pool.map(lambda _: second(folder, "writes", text(8.0)), range(2)))
-    assert [d.stdout.split() for d in done] == [["8.0"]] * 2, done[0].stderr[-2000:]
-    (kept,) = folder.iterdir()  # no partial file is left
-    content = kept.read_bytes()
-    assert hashlib.sha256(content[DIGEST:]).digest() == content[:DIGEST]
-    assert stored(8.0) == 8.0 and not compilations
-    assert second(folder, "reads", text(8.0)).stdout.split() == ["8.0"]
 
 
 @pytest.mark.parametrize("damage", ["empty", "half", "one byte", "longer"])

@@ -327,23 +327,6 @@ def test_an_own_plant_is_made_by_its_file_or_its_recipe(tmp_path):
         identify.Config(log=file, plant=f"{file}:Demanding").make_plant()
 
 
-def test_a_log_without_a_gap_has_every_row_and_no_cut(tmp_path):
-    """The pendulum is recorded without jitter, so that one row lies in the middle."""
-    record, log = recipe("record_log"), tmp_path / "log.csv"
-    for gap, rows in ((0.0, 21), (0.12, 19)):  # 2.4 of twenty intervals hold two rows behind the middle
-        record.main(record.Config(log=log, plant="pendulum", horizon=1.0, gap=gap))
-        table = pd.read_csv(log)
-        assert len(table) == rows and np.diff(table["time"]).max() == pytest.approx(0.05 if not gap else 0.15)
-
-
-def test_a_plant_named_by_its_module_is_recorded_under_its_classical_controller(tmp_path):
-    record, tables = recipe("record_log"), []
-    for number, plant in enumerate(("wind_turbine", "rt_torchrl.envs.wind_turbine.plant:WindTurbine")):
-        record.main(record.Config(log=tmp_path / f"{number}.csv", plant=plant, horizon=10.0))
-        tables.append(pd.read_csv(tmp_path / f"{number}.csv"))
-    pd.testing.assert_frame_equal(*tables)
-
-
 def test_what_cannot_be_recorded_is_refused(tmp_path):
     record = recipe("record_log")
     for options, message in (

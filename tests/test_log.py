@@ -228,20 +228,6 @@ def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
         recorded(plant, policy_law(plant, policy), torch.Generator(), jitter=0.4)
 
 
-def test_jitter_and_noise_are_as_large_as_asked():
-    plant = LinearQuadratic(horizon=100.0)
-    law = policy_law(plant, plant.make_policy(torch.Generator().manual_seed(0)))
-    log, clean = (
-        recorded(plant, law, torch.Generator().manual_seed(2), jitter=0.4, noise=noise) for noise in (0.05, 0.0)
-    )
-    intervals = np.diff(log.times) / plant.dt
-    # Differences of uniform numbers on ±0.2: triangular on ±0.4, of deviation 0.4/√6; 1000 of them, five deviations.
-    assert 0.6 <= intervals.min() < 0.7 and 1.3 < intervals.max() <= 1.4
-    assert intervals.std() == pytest.approx(0.4 / math.sqrt(6.0), rel=0.1)
-    assert (log.columns["position"] / clean.columns["position"]).std() == pytest.approx(0.05, rel=0.12)
-    assert np.array_equal(log.columns["force"], clean.columns["force"])
-
-
 @pytest.mark.parametrize(
     ("unit", "signal", "number", "expected"),
     [

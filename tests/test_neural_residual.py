@@ -1,7 +1,5 @@
 """Networks in closures and in the vector field: starts, bounds, closed forms, and as a hypothesis beside others."""
 
-import copy
-
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
@@ -17,7 +15,6 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
@@ -55,22 +52,6 @@ def stirred(closure, scale=0.5):
         for weight in network.parameters():
             weight.add_(scale * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
     return closure
-
-
-def test_a_network_that_matters_nowhere_is_still_refused():
-    class Deaf(LinearClosure):
-        def __init__(self, matrix):
-            super().__init__(matrix)
-            generator = torch.Generator().manual_seed(0)
-            self.network = BoundedPerceptron([(-1.0, 1.0)], [1.0], hidden=(2,), generator=generator)
-
-    class Plant(LinearQuadratic):
-        def make_closure(self, generator):
-            return Deaf(super().make_closure(generator).matrix.detach())
-
-    with pytest.raises(ValueError, match=r"'network.network.2.weight' changes it at none") as raised:
-        check_plant(Plant(), steps=20, traced=False)
-    assert "network.0" not in str(raised.value)  # it matters once the last layer does
 
 
 def test_the_residual_is_the_bounded_network_in_the_units_of_the_plant():
@@ -125,22 +106,6 @@ def test_around_another_scheme_it_is_of_second_order():
         reference = end(LinearQuadratic, 0.01)
         coarse, fine = ((end(Exact, dt) - reference).norm().item() for dt in (0.2, 0.1))
     assert coarse / fine == pytest.approx(4.0, rel=0.15) and fine < 5e-3
-
-
-def test_the_continuous_adjoint_takes_the_sum():
-    plant = pushed(LinearQuadratic())
-    closure, policy = stirred(plant.make_closure(seeded(1))), plant.make_policy(seeded())
-    state, exogenous, _ = flight(plant)
-    weights = [w for module in (closure, policy) for w in module.parameters()]
-    reference, found = (
-        parameters_to_vector(
-            torch.autograd.grad(Rollout(plant, closure, policy, engine=engine).costs(state, exogenous).sum(), weights)
-        )
-        for engine in ("autograd", "odeint_adjoint")
-    )
-    assert (found - reference).norm() < 0.02 * reference.norm()  # it errs by O(dt)
-    with pytest.raises(ValueError, match="scheme of its own"):
-        Rollout(pushed(Exact()), closure, policy, engine="odeint_adjoint")
 
 
 def test_an_angle_turns_without_a_jump():
@@ -271,36 +236,6 @@ def test_noise_does_not_call_for_it_where_the_plant_is_right():
     assert twin.weights == {ALONE: 1.0} and misfits[FORCE] == pytest.approx(misfits[ALONE], rel=0.05)
 
 
-STATES = {
-    "wind_turbine": {"rotor_speed"},
-    "flapping_wing": {"forward_speed", "climb_speed"},
-    "cryogenic_tank": {"pressure"},
-}
-"""States that the residual of each shipped plant moves."""
-
-
-@pytest.mark.parametrize(
-    "plant, name", [(WindTurbine, "unknown torque"), (FlappingWing, FORCE), (CryogenicTank, "unknown heat")]
-)
-def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
-    plant = plant()
-    closure = plant.make_closure(torch.Generator().manual_seed(0))
-    assert name not in make_twin(plant, closure, HypothesesConfig()).twins
-    twin = make_twin(plant, closure, HypothesesConfig(which=(name,))).twins[name]
-    state, exogenous, commands = flight(plant, steps=1)
-    given = torch.zeros(2).double(), state, commands[:, 0], exogenous[:, 0]
-    steps = [p.step(*given, c).state for p, c in ((twin.plant, twin.closure), (plant, closure))]
-    assert torch.equal(*steps)
-    other = twin.plant.step(*given, stirred(twin.closure)).state
-    moved = {s.name for s, change in zip(plant.states, (other - steps[0]).abs().amax(0), strict=True) if change}
-    assert moved - set(plant.controller_states) >= STATES[plant.name]
-
-
-def test_names_with_commas_are_quoted():
-    with pytest.raises(ValueError, match=r"choose among 'lags', 'late, twice', 'position sensor', 'unknown force'"):
-        make_twin(Suspecting(), LinearClosure([[0.0, 0.0], [0.0, 0.0]]), HypothesesConfig(which=("inflow",)))
-
-
 # Closures with a perceptron in them: their start, the bounds that keep their physics, their identification.
 
 
@@ -398,31 +333,3 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
         # left to gain, some hundredths of the gradient.
         assert (found.gradient + prior * away).norm() <= 0.1 * found.gradient.norm()
     assert moved[0] > moved[1] > moved[2] > 0.0
-
-
-def test_a_prior_pulls_to_the_closure_that_a_training_begins_with_and_goes_on_doing_so():
-    """A stiff prior leaves a perceptron where it is: at the weights of an earlier training, not at random ones."""
-    plant = LinearQuadratic(horizon=4.0, noise=0.0)
-    twin, flown, exogenous = recorded(plant, batch=1)
-    record, config = flown.each()[0], AssimilationConfig(prior=1e9, inputs="record", method="levenberg_marquardt")
-    first = Assimilation(DigitalTwin(plant, Corrected(twin.closure)), config)
-    for weight in first.twin.closure.correction.parameters():
-        torch.nn.init.constant_(weight, 0.3)
-    first.begin()
-    again = Assimilation(DigitalTwin(plant, Corrected(copy.deepcopy(twin.closure))), config)
-    again.twin.closure.load_state_dict(first.twin.closure.state_dict())
-    again.load_state_dict(copy.deepcopy(first.state_dict()))
-    for assimilation in (first, again):
-        assimilation.update([record], [], 1, seeded())
-        for weight in assimilation.twin.closure.correction.parameters():
-            torch.testing.assert_close(weight, torch.full_like(weight, 0.3), rtol=0, atol=1e-4)
-
-
-def test_the_features_where_visited_are_those_of_the_closure():
-    """On the turbine, where the features are known: λ = ωR/u and the pitch."""
-    plant = PLANTS[0]
-    _, flown, exogenous = recorded(plant, batch=1)
-    record = flown.each()[0]
-    features = visited_features(plant, record)
-    lam = 63.0 * record.states[:-1, 0] / record.exogenous[:, 0]
-    torch.testing.assert_close(features, torch.stack([lam, record.actions[:, 1]], -1), rtol=1e-14, atol=0)

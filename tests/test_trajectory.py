@@ -8,7 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from scipy.linalg import expm
 from scipy.optimize import brentq
 from seeds_and_numbers import double
@@ -25,7 +25,7 @@ from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin, constant
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
@@ -67,42 +67,6 @@ def test_converges_to_the_matrix_exponential(engine):
     assert math.log2(errors[1] / errors[2]) == pytest.approx(4.0, abs=0.15), errors
     # dt⁴/120 over 8 s for states and inputs of about 2: 1.3e-5.
     assert errors[2] < 3e-5
-
-
-def test_engines_fly_one_realisation_alike():
-    plant = LinearQuadratic(horizon=2.0)
-    state, exogenous, _ = drawn(plant, 1)
-    policy = plant.make_policy(torch.Generator().manual_seed(1))
-    first, *others = (
-        Rollout(plant, plant.closure, policy, engine=engine)(state, exogenous) for engine in (*ENGINES, "native")
-    )
-    assert first.states.shape == (1, 21, 2) and first.actions.shape == (1, 20, 1)
-    for other in others:
-        # One tableau, written by torchdiffeq in another order of operations.
-        torch.testing.assert_close(other.states, first.states, rtol=1e-13, atol=1e-14)
-        torch.testing.assert_close(other.actions, first.actions, rtol=1e-13, atol=1e-14)
-
-
-class Clock(LinearQuadratic):
-    """A plant that shows the policy the time, and whose cost depends on it."""
-
-    def observe(self, t, state, exogenous):
-        time = t.unsqueeze(-1).expand_as(state[..., :1])
-        return torch.cat([time, exogenous.expand_as(time)], -1)
-
-    def running_cost(self, t, state, applied, exogenous):
-        return t.expand_as(state[..., 0])
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_time_and_inputs_reach_the_policy_and_the_cost(engine):
-    plant = Clock(dt=0.25, horizon=2.0, noise=1.0)
-    state, exogenous, _ = drawn(plant, 2)
-    flown = Rollout(plant, plant.closure, LinearGain([[-1.0, -1.0]]), engine=engine)(state, exogenous, start=3.0)
-    t = 3.0 + 0.25 * torch.arange(8, dtype=torch.float64)
-    torch.testing.assert_close(flown.actions[..., 0], t + exogenous[..., 0], rtol=1e-15, atol=1e-15)
-    # Mean of 3, 3.25, ..., 4.75.
-    torch.testing.assert_close(control_cost(plant, flown), t.new_full((2,), 3.875))
 
 
 def test_segments_are_parts_on_the_clock_of_the_plant():
@@ -277,22 +241,6 @@ def test_a_policy_in_single_precision_is_refused_also_later():
     twin.cost(policy, *episodes)
     with pytest.raises(ValueError, match="torch.float32"):
         twin.cost(policy.float(), *episodes)
-
-
-def test_each_policy_has_its_own_cost_with_the_weights_and_the_plant_of_now():
-    twin, policy, episodes = twin_and_policy()
-    other = copy.deepcopy(policy)
-    with torch.no_grad():
-        next(other.parameters()).add_(0.3)
-    costs = [twin.cost(each, *episodes) for each in (policy, other, policy)]
-    assert torch.equal(costs[0], costs[2]) and not torch.equal(costs[0], costs[1])
-    with torch.no_grad():
-        next(twin.closure.parameters()).add_(0.1)
-    costs.append(twin.cost(policy, *episodes))
-    twin.plant = LinearQuadratic(dt=0.5 * twin.plant.dt)
-    costs.append(twin.cost(policy, *episodes))
-    assert costs[4] == DigitalTwin(twin.plant, twin.closure).cost(policy, *episodes)
-    assert len({cost.item() for cost in costs}) == 4
 
 
 # Forward sensitivities and Levenberg-Marquardt against backpropagation and known minima

@@ -224,9 +224,9 @@ class WindTurbine(Plant):
 
     def time_constant(self, wind_speed: float) -> float:
         r"""Time constant −1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and fine pitch."""
-        given = self.greatest_increment.new_tensor([self.rated_rotor_speed, 0.0, wind_speed])
-        omega_r, beta, u = given.requires_grad_().unbind()
-        torque = self.aerodynamic_torque(omega_r, beta, u, self.closure)
+        omega_r, beta, u = self.greatest_increment.new_tensor([self.rated_rotor_speed, 0.0, wind_speed])
+        with torch.enable_grad():
+            torque = self.aerodynamic_torque(omega_r.requires_grad_(), beta, u, self.closure)
         (slope,) = torch.autograd.grad(torque, omega_r)
         return -self.inertia / slope.item()
 

@@ -246,8 +246,12 @@ class PositionedActuator(Actuator):
         """The position at the end of an interval in which an action is asked for."""
         raise NotImplementedError
 
+    def begun(self, x: Cost, asked: Cost) -> Cost:
+        """The position that acts at the start of an interval; by default that of its end: the motion takes no time."""
+        return self.moved(x, asked)
+
     def mean(self, x: Cost, end: Cost, asked: Cost) -> Cost:
-        """The mean position over the interval; by default that of its end, where the motion takes no time."""
+        """The mean position over the interval; by default that of its end."""
         return end
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
@@ -256,7 +260,7 @@ class PositionedActuator(Actuator):
         return replaced(applied, self.place, self.mean(x, end, asked)), end.unsqueeze(-1)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, self.moved(hidden[..., 0], applied[..., self.place]))
+        return replaced(applied, self.place, self.begun(hidden[..., 0], applied[..., self.place]))
 
 
 class RateLimitedActuator(PositionedActuator):
@@ -275,8 +279,8 @@ class RateLimitedActuator(PositionedActuator):
         moving = ((asked - x).abs() / (self.size * self.dt)).clamp(max=1.0)
         return end - 0.5 * moving * (end - x)
 
-    def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return Actuator.acting(self, hidden, applied)
+    def begun(self, x: Cost, asked: Cost) -> Cost:
+        return x
 
 
 class PlayActuator(PositionedActuator):
