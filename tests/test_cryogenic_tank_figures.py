@@ -111,33 +111,6 @@ def test_heat_exchanger_of_each_closure(snapshot):
     assert share.get_xlabel().endswith("[kPa]")
 
 
-def test_coefficients_of_a_neural_closure_over_each_feature(snapshot):
-    """The others are at their means in the episode; the axes go half of the visited range beyond it on both sides."""
-    plant, record = snapshot.plant, snapshot.record
-    twin = plant.make_neural_closure(generator := torch.Generator().manual_seed(1), [4]).requires_grad_(False)
-    for weight in twin.correction.parameters():
-        weight += torch.randn(weight.shape, generator=generator, dtype=weight.dtype)
-    assert "coefficients" not in figures.figures_of(snapshot)
-    figure = figures.figures_of(replace(snapshot, closure=twin))["coefficients"]
-    T_s, V_l, p = record.states[:-1].unbind(-1)
-    units = (500.0, plant.volume, 50.0, 200.0)  # kPa, m³, mK, kPa
-    quantities = 1e-3 * p, V_l, 1e3 * (T_s - plant.saturation(p).T), 1e-3 * record.actions[:, 0]
-    seen = torch.stack([quantity / unit for quantity, unit in zip(quantities, units, strict=True)], -1)
-    for k, (column, unit) in enumerate(zip(np.array(figure.axes).reshape(3, 4).T, units, strict=True)):
-        x = torch.tensor(line(column[0], "twin").get_xdata())
-        low, high = seen[:, k].min().item(), seen[:, k].max().item()
-        ends = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
-        assert x[[0, -1]].tolist() == pytest.approx([unit * end for end in ends], rel=1e-9)
-        points = seen.mean(0).repeat(len(x), 1)
-        points[:, k] = x / unit
-        for ax, found, (name, true) in zip(column, twin(points).T, TRUE.items(), strict=True):
-            scale = 1e-9 if name == "K_JT" else 1.0
-            np.testing.assert_allclose(line(ax, "twin").get_ydata(), scale * found.numpy(), rtol=1e-9)
-            assert found.std() > 1e-6 * found.mean()
-            np.testing.assert_allclose(line(ax, "true").get_ydata(), scale * true, rtol=1e-12)
-    draw(figure)
-
-
 def test_closure_weights_with_truth_start_and_units(snapshot):
     figure = figures.figures_of(snapshot)["closure_weights"]
     for ax, (name, found) in zip(figure.axes, FOUND.items(), strict=True):

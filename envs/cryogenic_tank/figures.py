@@ -1,4 +1,4 @@
-"""Figures of the cryogenic tank: its days in orbit, its heat exchanger, its coefficients, and an animation."""
+"""Figures of the cryogenic tank: its days in orbit, its heat exchanger, and an animation."""
 
 from typing import Any, cast
 
@@ -9,9 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
-from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
-from rt_torchrl.evaluation.checks import visited_features
+from rt_torchrl.envs.cryogenic_tank.plant import BAND, CryogenicTank
 from rt_torchrl.figures import style
 from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.snapshot import Snapshot
@@ -20,7 +18,6 @@ from rt_torchrl.figures.training import closure_weights, tracked_weights
 
 POINTS = 720
 """Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
-DAY = 86_400.0
 PUFFS = 12
 """Greatest number of drawn puffs of vented gas."""
 LABELS = {
@@ -38,8 +35,6 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     drawn = {figure.__name__: figure(snapshot) for figure in (tank, *over_drops)}
     if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
         drawn["closure_weights"] = closure_weights(snapshot, LABELS)
-    if not isinstance(snapshot.closure, ConstantCoefficients):
-        drawn["coefficients"] = coefficients(snapshot)
     return drawn
 
 
@@ -135,41 +130,6 @@ def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Ten
     """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
     return p - plant.valve_outlet(p, plant.opening(actions[:, 0])[0])
-
-
-@torch.no_grad()
-def coefficients(snapshot: Snapshot) -> Figure:
-    """U_s, U_HX and K_JT over each feature of the closure, with the other features at their mean in the last episode.
-
-    Curves are pale where the episode did not visit; the axes extend the visited range by half of it on both sides.
-    """
-    plant = cast(CryogenicTank, snapshot.plant)
-    seen = visited_features(plant, snapshot.record)
-    axes_of = (
-        ("pressure [kPa]", 1e-3 * plant.set_point),
-        ("liquid volume [m³]", plant.volume),
-        ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
-        ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
-    )
-    title = f"Coefficients, {style.episode(snapshot)}\nother features at their mean in the episode"
-    figure, axes = style.panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
-    for column, (label, unit) in enumerate(axes_of):
-        low, high = seen[:, column].min(), seen[:, column].max()
-        reach = 0.5 * (high - low).clamp(min=1e-6)
-        points = seen.mean(0).repeat(121, 1)
-        ends = (low - reach).item(), (high + reach).item()
-        points[:, column] = torch.linspace(*ends, 121, dtype=seen.dtype, device=seen.device)
-        x, inside = unit * points[:, column], (points[:, column] >= low) & (points[:, column] <= high)
-        for name, closure in style.closures(snapshot).items():
-            for ax, values, (_, factor) in zip(axes[:, column], closure(points).T, LABELS.values(), strict=True):
-                ax.plot(array(x), factor * array(values), **style.closure_look(name))
-        for ax, (name, _) in zip(axes[:, column], LABELS.values(), strict=True):
-            ax.set_yscale("log")
-            style.veil(ax, array(x), array(inside))
-            caption(ax, name if column == 0 else "")
-        axes[-1, column].set_xlabel(label)
-    style.legend_below(figure, [axes[0, 0]])
-    return figure
 
 
 @torch.no_grad()
