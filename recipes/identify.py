@@ -174,8 +174,7 @@ def metrics_of(found: Identified) -> dict[str, Any]:
     estimate, uncertainty = found.estimate, found.estimate.uncertainty
     sensors, states = estimate.likelihood.sensors, estimate.likelihood.plant.states
     names, units = [sensor.name for sensor in sensors], [sensor.measurement.unit for sensor in sensors]
-    summary: dict[str, Any] = {"iterations": estimate.iterations, "prior": estimate.stiffness}
-    summary["segment"] = estimate.segment
+    summary: dict[str, Any] = {"iterations": estimate.iterations, "segment": estimate.segment}
     for side in ("training", "held_out"):
         before, after = (judged.rms.tolist() for judged in getattr(found, side))
         each = zip(names, units, before, after, strict=True)

@@ -2,13 +2,10 @@ r"""The least-squares fit of a twin: weights, initial states, biases and noise l
 
 The descent over all unknowns and the levels take turns, until the levels rest:
 
-.. math::
-    \sigma_j^2 = \frac{\sum_kr_{kj}^2}{N_j\,(1 - p/N)}, \qquad \Lambda = \frac{\gamma}{\|w - w^0\|^2}, \qquad
-    \gamma = \sum_i\big(1 - \Lambda H^{-1}_{ii}\big)
+.. math:: \sigma_j^2 = \frac{\sum_kr_{kj}^2}{N_j\,(1 - p/N)}
 
-with N_j samples of sensor j out of N, p unknowns that the data determine, and γ of them among the weights of
-perceptrons (MacKay, Neural Computation 4 (1992) 415). Step 4 of a training takes the same residuals, with the known
-noise of :func:`rt_torchrl.fit.sensors.state_sensors`.
+with N_j samples of sensor j out of N, and p unknowns that the data determine. Step 4 of a training takes the same
+residuals, with the known noise of :func:`rt_torchrl.fit.sensors.state_sensors`.
 
 Over a whole record of an unstable system the twin explodes whatever its weights are, and J prefers wrong ones. Records
 are then cut into segments with first states of their own (multiple shooting), whose length the data choose.
@@ -45,8 +42,6 @@ FIRST_NOISE = 0.1
 """First guess of an unknown noise level, as a share of the scatter of the readings."""
 LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
-STIFFNESS = (1e-6, 1e8)
-"""Range of the prior's stiffness Λ where the data choose it."""
 EXPLAINED = 0.5
 """RMS error of a sensor, as a share of the scatter of its readings, below which a twin explains them."""
 SHORT = 60
@@ -202,9 +197,8 @@ class EstimationConfig:
 
     Args:
         iterations: trial steps of each descent.
-        rounds: greatest number of rounds in which noise levels and prior follow the residuals.
-        prior: stiffness Λ of the weights of the closure's perceptrons; None lets the data choose it. Other weights
-            have no prior.
+        rounds: greatest number of rounds in which noise levels follow the residuals.
+        prior: stiffness Λ of the weights of the closure's perceptrons. Other weights have no prior.
         starts: number of first weights that the descent begins with. Beside the present ones these are the present ones
             and the best ones so far in turns, moved at random: one sensor may leave several local minima.
         errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
@@ -216,7 +210,7 @@ class EstimationConfig:
 
     iterations: AtLeastOne = 30
     rounds: AtLeastOne = 10
-    prior: NotNegative | None = 0.0
+    prior: NotNegative = 0.0
     starts: AtLeastOne = 1
     errors: Errors = "fisher"
     segment: Count | None = None
@@ -230,7 +224,6 @@ class Estimate(NamedTuple):
         noise: noise level of each sensor, by name, in its unit.
         biases: bias of each sensor, by name; zero for one without.
         initial: initial states of the records.
-        stiffness: stiffness Λ of the prior.
         likelihood: the likelihood at its minimum.
         uncertainty: standard errors, intervals and warnings.
         iterations: number of trial steps.
@@ -242,7 +235,6 @@ class Estimate(NamedTuple):
     noise: dict[str, float]
     biases: dict[str, float]
     initial: Float[Tensor, "records n_s"]
-    stiffness: float
     likelihood: Likelihood
     uncertainty: Uncertainty
     iterations: int
@@ -316,7 +308,7 @@ class Estimation:
             minimum = self._longest(records)
         else:
             minimum = self._minimum(records, self.config.segment or 0)
-        likelihood, prior = minimum.likelihood, minimum.likelihood.prior
+        likelihood = minimum.likelihood
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
             before,
@@ -324,7 +316,6 @@ class Estimation:
             dict(zip(names, likelihood.noise.tolist(), strict=True)),
             dict(zip(names, likelihood.biases().tolist(), strict=True)),
             likelihood.initial().detach(),
-            0.0 if prior is None else prior.stiffness,
             likelihood,
             Uncertainty(likelihood, errors=self.config.errors),
             minimum.iterations,
@@ -336,7 +327,7 @@ class Estimation:
         closure, config = self.twin.closure, self.config
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
-        prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior)
+        prior = WeightPrior(closure, config.prior)
         minimum = best_of(multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number)))
         iterations = minimum.iterations
         for _ in range(config.rounds):
@@ -438,20 +429,13 @@ class Estimation:
         return Minimum(likelihood, descended.best, descended.iterations)
 
     def _follow_residuals(self, likelihood: Likelihood) -> bool:
-        """Set noise levels and prior by the residuals; whether they rest."""
+        """Set noise levels by the residuals; whether they rest."""
         blocks = likelihood.residuals()
         equations = likelihood.normal_equations(blocks)
         if not equations.matrix.isfinite().all():
             raise FloatingPointError("the derivatives of finite states overflow")
         inverse = inverse_information(equations.matrix).matrix
-        rest, n, prior = True, likelihood.weight_count, likelihood.prior
         determined = likelihood.count - likelihood.held_back(inverse)
-        if self.config.prior is None and prior is not None and prior.held.any():
-            gamma = (prior.held * (1.0 - prior.stiffness * inverse.diagonal()[:n])).sum()
-            moved = (prior.held * (prior.weights() - prior.start).square()).sum()
-            new = (gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS).item()
-            rest = abs(math.log(new / prior.stiffness)) < SETTLED
-            prior.stiffness = new
         given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
         squares = torch.stack([block.values.square().sum((0, 1)) for block in blocks]).sum(0)
         total = int(likelihood.samples.sum())
@@ -459,7 +443,7 @@ class Estimation:
         floor = LEAST_NOISE * first_noise(self.sensors, likelihood.records)
         levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
         levels = torch.where(given, likelihood.noise, levels)
-        rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
+        rest = bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
         likelihood.noise = levels
         return rest
 
