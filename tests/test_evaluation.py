@@ -1,9 +1,12 @@
 """The reference optimum of classes of policies, the gradient check of a run's start, and what cannot be flown."""
 
+import math
+
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from scipy.optimize import minimize
+from seeds_and_numbers import double
 from small_runs import small_run, stepped_cost
 from torch import nn
 
@@ -16,10 +19,22 @@ from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 from rt_torchrl.plants.actuators import StickingActuator
 from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.rollout import ENGINES
+
+
+def test_excesses_over_bounds_by_hand():
+    bounds = StateBounds(LinearQuadratic.states, {"position": (-1.0, 2.0), "velocity": (-math.inf, 0.5)})
+    found = bounds.merit(double([9.0, 9.0], [-1.5, 0.5], [2.25, 0.0], [0.0, 1.0], [3.0, 0.0]).unsqueeze(0))
+    assert {name: value.item() for name, value in found.items()} == {
+        "position outside [%]": 75.0,
+        "position beyond [m]": 1.0,
+        "velocity outside [%]": 25.0,
+        "velocity beyond [m/s]": 0.5,
+    }
 
 
 def random_gain(generator):
