@@ -8,12 +8,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = {
     "wind_turbine": (
-        *("flights.png", "states.png", "actions.png", "power_and_speed.png", "power_coefficient.png", "scatter.png"),
-        *("exogenous.png", "policy_contours.png", "closure_weights.png", "learning_curves.png", "seconds.png"),
-        *("unseen.png", "animation.gif"),
+        *("flights.png", "states.png", "power_and_speed.png", "power_coefficient.png", "scatter.png"),
+        *("exogenous.png", "policy_contours.png", "closure_weights.png", "learning_curves.png", "unseen.png"),
     ),
-    "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png", "animation.gif"),
-    "cryogenic_tank": ("tank.png", "animation.gif"),
+    "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png"),
+    "cryogenic_tank": ("tank.png",),
 }
 """Files of each plant that the gallery shows, by the name of its recipe."""
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading, configuration
@@ -203,12 +202,6 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
     return figures.figures_of(snapshot)
 
 
-def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.cryogenic_tank.figures import scene
-
-    scene(snapshot).save(path)
-
-
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
@@ -220,7 +213,6 @@ def main(config: Config, **parts: Any) -> None:
         plant_figures=plant_figures,
         baselines=VALVES,
         first=PIValve,
-        animate=animate,
         **parts,
     ).train()
 

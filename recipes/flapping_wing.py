@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rt_torchrl import begin_loading, configuration
@@ -195,12 +194,6 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
     return figures.figures_of(snapshot)
 
 
-def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.flapping_wing.figures import scene
-
-    scene(snapshot).save(path)
-
-
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
@@ -212,7 +205,6 @@ def main(config: Config, **parts: Any) -> None:
         plant_figures=plant_figures,
         baselines={"PD": TrimmedPD},
         first=TrimmedPD,
-        animate=animate,
         **parts,
     ).train()
 

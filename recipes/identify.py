@@ -160,7 +160,6 @@ def main(config: Config) -> None:
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     drawn = {
         "twin_and_log": charts.twin_and_sensors(found),
-        "weights": charts.weights(found.estimate),
         "correlations": charts.correlations(found.estimate.uncertainty),
     }
     for name, figure in drawn.items():

@@ -173,12 +173,6 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
     return figures.figures_of(snapshot)
 
 
-def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.wind_turbine.figures import scene
-
-    scene(snapshot).save(path)
-
-
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
@@ -190,8 +184,8 @@ def main(config: Config, **parts: Any) -> None:
         config = dataclasses.replace(config, real_unseen=config.real_unseen or config.unseen)  # a simulator may fly
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     believed = config.believed()
-    drawing = {"plant_figures": plant_figures, "animate": animate}
-    Run(config, plant, believed=believed, first=JonkmanController, **drawing, **system, **parts).train()
+    parts = {"plant_figures": plant_figures, **system, **parts}
+    Run(config, plant, believed=believed, first=JonkmanController, **parts).train()
 
 
 if __name__ == "__main__":

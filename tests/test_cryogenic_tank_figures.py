@@ -7,7 +7,6 @@ import pytest
 import torch
 from figure_reading import draw, line, panel, snapshot_of
 
-from rt_torchrl import figures as general
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -52,13 +51,6 @@ def test_tank_is_the_record(snapshot):
     assert load.get_xlim() == pytest.approx((0.0, 6.0), rel=1e-12)
 
 
-def test_pressure_has_its_set_point_and_band(snapshot):
-    pressure = panel(figures.tank(snapshot), "pressure")
-    assert line(pressure, r"set point $\tilde p$").get_ydata()[0] == 500.0
-    (band,) = pressure.patches
-    assert (band.get_y(), band.get_y() + band.get_height()) == (495.0, 505.0)
-
-
 def test_long_records_are_thinned_to_mean_and_range(snapshot):
     # Twice the six hours and a bit: groups of three, the last with one sample.
     record = snapshot.record
@@ -76,17 +68,6 @@ def test_long_records_are_thinned_to_mean_and_range(snapshot):
     vertices = load.collections[0].get_paths()[0].vertices[:, 1]
     assert (vertices.min(), vertices.max()) == (values.min(), values.max())
     assert any("every 1.5 min" in text for text in draw(figure))
-
-
-def test_a_twin_far_off_does_not_flatten_the_real_tank(snapshot):
-    far = snapshot.replay.clone()
-    far[:, 0] += 100.0
-    ax = panel(figures.tank(replace(snapshot, replay=far)), "wall-fluid")
-    real = line(ax, "real").get_ydata()
-    low, high = ax.get_ylim()
-    assert low < real.min() and real.max() < high
-    # The axes of the real tank alone, with margins of 5 %, and as much again above.
-    assert high - low <= 2.0 * 1.1 * 1.001 * np.ptp(real)
 
 
 def test_heat_exchanger_of_each_closure(snapshot):
@@ -121,15 +102,3 @@ def test_closure_weights_with_truth_start_and_units(snapshot):
         assert line(ax, "start").get_ydata()[0] == pytest.approx(scale * start, rel=1e-14)
         assert ax.get_yscale() == "log" and ax.get_title(loc="left").endswith("]")
         assert ax.get_title(loc="right") == f"{100 * (found[-1] / TRUE[name] - 1):+.2g} %"
-
-
-def test_closure_weights_are_left_out_of_older_records(snapshot):
-    for episodes in ([], [{}], [{"closure": None}], [{"closure": {"weight": [[1.0, 2.0]]}}]):
-        older = replace(snapshot, episodes=episodes)
-        assert "closure_weights" not in figures.figures_of(older)
-    # Of a run that was resumed from such a record the new part is drawn.
-    resumed = replace(snapshot, episodes=[{}, *snapshot.episodes])
-    found = line(general.figures_of(resumed)["closure_weights"].axes[0], "twin").get_ydata()
-    assert np.isnan(found[0]) and list(found[1:]) == FOUND["U_s"]
-    untrained = replace(snapshot, large_scale=None, realisations=None)
-    assert "closure_weights" not in general.figures_of(untrained) | figures.figures_of(untrained)

@@ -211,7 +211,7 @@ def test_a_training_learns_from_episodes_of_unequal_length(system):
         )
         n = len(found.short_term[-1].actions)
         assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
-        assert {"states", "actions", "exogenous"} <= figures_of(snapshot).keys()
+        assert {"states", "exogenous"} <= figures_of(snapshot).keys()
     reports += [found.episode() for _ in range(4)]
     lengths = [len(flown.trajectory.actions) for flown in found.belief.flown]
     first = reports[0]

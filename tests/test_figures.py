@@ -33,7 +33,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}
+EVERYWHERE = {"states", "policy_contours", "learning_curves"}
 
 
 def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
@@ -98,27 +98,6 @@ def test_states_are_record_and_replay_with_units_and_residual(name, request):
     assert "time [s]" in draw(figure)
 
 
-@pytest.mark.parametrize(("horizon", "unit"), [(1200.0, "s"), (3600.0, "min"), (36_000.0, "h")])
-def test_time_axis_suits_the_horizon(oscillator, horizon, unit):
-    # Twelve intervals, however long: the figure knows the plant's dt alone.
-    plant, record = LinearQuadratic(dt=horizon / 12, horizon=horizon), oscillator.record
-    short = record.part(0, 12, plant.dt)
-    figure = figures.actions(replace(oscillator, plant=plant, record=short))
-    assert figure.axes[-1].get_xlabel() == f"time [{unit}]"
-    length = {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]
-    assert figure.axes[-1].get_xlim() == pytest.approx((0.0, horizon / length), rel=1e-12)
-
-
-def test_actions_are_applied_ones_between_their_limits(turbine):
-    figure = figures.actions(turbine)
-    for k, (ax, signal) in enumerate(zip(figure.axes, turbine.plant.actions, strict=True)):
-        assert same(ax.lines[0], turbine.record.actions[:, k])
-        assert [ax.get_title(loc="left"), ax.lines[0].get_drawstyle()] == [signal.label, "steps-post"]
-        assert [limit.get_ydata()[0] for limit in ax.lines[1:]] == [signal.low, signal.high]
-    # Who acted is who was live then, not who is live after the switch.
-    assert "model-free, live" in draw(figures.actions(replace(turbine, live="model_based")))
-
-
 def test_exogenous_shows_record_mean_and_samples(turbine):
     above, below = figures.exogenous(turbine).axes
     assert same(line(above, "recorded"), turbine.record.exogenous[:, 0])
@@ -157,31 +136,20 @@ def test_contours_are_the_policies(name, request, monkeypatch):
 
 
 class Observing(LinearQuadratic):
-    """The oscillator seen through the first or more of its state, and through its force."""
+    """The oscillator seen through the first of its states."""
 
-    def __init__(self, count):
-        super().__init__(horizon=2.0)
-        self.observations = tuple(
-            Signal(symbol=f"e_{k + 1}", name=f"error_{k + 1}", unit="-", low=-1.0, high=1.0) for k in range(count)
-        )
+    observations = (Signal(symbol="e", name="error", unit="-", low=-1.0, high=1.0),)
 
     def observe(self, t, state, exogenous):
-        return torch.cat([state, exogenous], -1)[..., : len(self.observations)]
+        return state[..., :1]
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_policies_of_one_and_of_three_observations(oscillator, count):
-    plant, gain = Observing(count), torch.tensor([[0.5, -0.2, 3.0]], dtype=torch.float64)[:, :count]
+def test_policies_of_one_observation_are_curves(oscillator):
+    gain = torch.tensor([[0.5]], dtype=torch.float64)
     policies = {"model_based": LinearGain(gain), "model_free": LinearGain(0.0 * gain)}
-    snapshot = replace(oscillator, plant=plant, policies=policies)
-    figure = figures.policy_contours(snapshot)
-    texts = draw(figure)
-    if count == 1:
-        curve = line(figure.axes[0], "model-based")
-        np.testing.assert_allclose(curve.get_ydata(), -0.5 * curve.get_xdata(), rtol=1e-15)
-        assert plant.observations[0].label in texts
-    else:
-        assert any("other observations at their mean" in text for text in texts)
+    figure = figures.policy_contours(replace(oscillator, plant=Observing(), policies=policies))
+    curve = line(figure.axes[0], "model-based")
+    np.testing.assert_allclose(curve.get_ydata(), -0.5 * curve.get_xdata(), rtol=1e-15)
 
 
 def test_learning_curves_timeline_and_events(oscillator):
@@ -193,10 +161,8 @@ def test_learning_curves_timeline_and_events(oscillator):
     figure = figures.learning_curves(replace(oscillator, episodes=episodes))
     control, identification, strip = figure.axes
     assert list(line(control, "real system, live").get_ydata()) == [4.0, 3.0, 2.0, 1.0]
-    assert control.get_yscale() == identification.get_yscale() == "log"
     # J_a spans less than a decade and J_p spans three.
-    assert control.yaxis.get_minor_formatter()(3.0) == control.yaxis.get_major_formatter()(3.0) == "3"
-    assert "10^" in identification.yaxis.get_major_formatter()(0.01)
+    assert (control.get_yscale(), identification.get_yscale()) == ("linear", "log")
     # An event closes its episode.
     assert [line(control, event).get_xdata()[0] for event in ("swap", "clone")] == [1.5, 2.5]
     spans = [
@@ -219,15 +185,7 @@ def test_arms_leave_out_what_they_do_not_have(arm):
         draw(figure)
     draw(figures.exogenous(snapshot))
     bare = replace(snapshot, episodes=[])
-    assert set(figures.figures_of(bare)) == set(drawn) - {"learning_curves", "seconds"}
-
-
-def test_seconds_are_stacked(oscillator):
-    (ax,) = figures.seconds(oscillator).axes
-    tops = [max(bar.get_y() + bar.get_height() for bar in column) for column in zip(*ax.containers, strict=True)]
-    totals = [sum(episode["seconds"].values()) for episode in oscillator.episodes]
-    assert tops == pytest.approx(totals, rel=1e-12)
-    assert ax.get_title(loc="left") == "wall-clock time [s]"
+    assert set(figures.figures_of(bare)) == set(drawn) - {"learning_curves"}
 
 
 def test_power_and_speed_against_their_references(turbine):
@@ -262,14 +220,6 @@ def test_power_coefficient_of_true_table_and_twin_side_by_side(turbine):
     for ax in (table, law, error):
         np.testing.assert_allclose(np.stack(line(ax, "visited").get_data(), -1), visited, rtol=1e-12)
     assert f"visited: {(twin - true).square().mean().sqrt():.2g}" in figure._suptitle.get_text()
-
-
-def test_scatter_is_twin_over_real(turbine):
-    (ax,) = turbine_figures.scatter(turbine).axes
-    points = line(ax, "sample")
-    assert same(points, 97.0 * turbine.replay[:, 0])
-    assert np.array_equal(points.get_xdata(), 97.0 * turbine.record.states[:, 0].numpy())
-    assert "rad/s" in ax.get_title(loc="left") and "rad/s" in ax.get_xlabel()
 
 
 def flown(plant, count=1, n=40):
@@ -315,14 +265,6 @@ def test_every_controller_is_drawn_and_the_setpoint_once():
     assert figure.axes[2].lines[0].get_ydata() == pytest.approx(one.actions[0, :, 0].numpy())
 
 
-def test_a_plant_without_setpoints_shows_its_states():
-    plant = Pendulum(horizon=1.0)
-    one = flown(plant, n=plant.n_steps).each()[0]
-    figure = flights(plant, {"model_free": one})
-    assert len(figure.axes) == len(plant.states) + len(plant.actions)
-    assert figure.axes[0].lines[0].get_ydata() == pytest.approx(one.states[:-1, 0].numpy())
-
-
 COUNT = 12
 
 
@@ -349,14 +291,7 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
     assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
 
 
-@pytest.mark.parametrize("where", ["", "on the twin"])
-def test_the_title_of_a_single_panel_is_whole(where):
-    costs = {name: found._replace(merit={}) for name, found in judged("model_based", "model_free", "PI").items()}
-    figure = figures.unseen(costs, {}, where=where)
-    assert "bar: mean" in " ".join(draw(figure)) and clipped_texts(figure) == []
-
-
-@pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (0.0, "linear"), (-0.5, "linear")])
+@pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (-0.5, "linear")])
 def test_only_positive_costs_have_a_logarithmic_axis(oscillator, least, scale):
     found = judged("model_based", "model_free", "on-off", "Jonkman")
     found["Jonkman"].control_costs[0] = least

@@ -1,4 +1,4 @@
-"""The drone's figures and animation against the numbers they are drawn from, on a short flight."""
+"""The drone's figures against the numbers they are drawn from, on a short flight."""
 
 import math
 from dataclasses import replace
@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 from figure_reading import draw, line, panel, snapshot_of
-from torch import nn
 
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -49,19 +47,6 @@ def test_collectors_path_is_the_record(snapshot):
 
 def _side_labels(plant):
     return plant.inputs[0].label, "distance to the target [m]"
-
-
-def test_collectors_path_marks_seconds_and_leaves_out_what_there_is_not(snapshot):
-    # The same record read at a longer interval lasts two seconds; the last mark is its end.
-    slow = FlappingWing(horizon=0.2)
-    slow.dt = 5e-3
-    figure = figures.flight_path(replace(snapshot, plant=slow, large_scale=None))
-    path, wind = panel(figure, "vertical plane"), panel(figure, slow.inputs[0].label)
-    assert np.array_equal(line(path, "every second").get_xydata(), snapshot.record.states[[200, 400], :2].numpy())
-    (arrows,) = path.collections
-    # A headwind blows towards -x.
-    np.testing.assert_array_equal(arrows.U, -snapshot.record.exogenous[[199, 399], 0].numpy())
-    assert [entry.get_label() for entry in wind.lines if entry.get_label()[0] != "_"] == ["recorded"]
 
 
 def test_collectors_is_the_record_and_its_means_over_the_beats(snapshot):
@@ -117,19 +102,6 @@ def test_visited_angles_are_those_of_the_kinematics(snapshot):
     # The floor of the speed, 0.01 m/s, shortens the direction by (0.01 / 0.7 m/s)^2 / 2 where the wing is slowest.
     np.testing.assert_allclose(sine[moving], (direction * np.cos(pitch))[moving], atol=2e-4)
     np.testing.assert_allclose(cosine[moving], (direction * np.sin(pitch))[moving], atol=2e-4)
-
-
-def test_visited_angles_are_those_of_the_element_at_seventy_percent(snapshot):
-    """The sines of the six nodes are 0.05, 0.26, 0.56, 0.83, 0.97 and 1.00 of the length."""
-    everywhere = visited_features(snapshot.plant, snapshot.record)
-    assert torch.equal(figures.visited_features(snapshot), everywhere[:, 3])
-
-
-def test_polars_of_a_law_without_named_coefficients(snapshot):
-    network = nn.Sequential(nn.Linear(2, 2, dtype=torch.float64))
-    figure = figures.polars(replace(snapshot, closure=network, initial_closure=network))
-    title = figure._suptitle.get_text()
-    assert "true: a = 1.71" in title and "twin" not in title
 
 
 def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapshot):

@@ -78,8 +78,6 @@ def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plan
     made, drawn = load_recipe(RECIPES / f"{plant}.py"), plant == "wind_turbine"
     small = {"episodes": 1, "unseen": 2, "figures": drawn, "twinning": SMALL}
     config = made.Config(**CHOICES[plant], **small, policy="mlp", hidden=(3,), log_dir=tmp_path)
-    # A hundred frames of a flight show nothing of its settings.
-    monkeypatch.setattr(made, "animate", None, raising=False)
     made.main(config)
     run = load_run(tmp_path)
     assert settings_of(run.config, plant) == settings_of(config, plant) and run.plant.cost == config.plant().cost
@@ -345,7 +343,7 @@ def test_impossible_requests_are_refused(run):
     ):
         with pytest.raises(ValueError, match=message):
             run.simulate(policy, **arguments)
-    with pytest.raises(ValueError, match="figure 'state' does not exist in this run; choose one of actions"):
+    with pytest.raises(ValueError, match="figure 'state' does not exist in this run; choose one of "):
         run.figure("state")
 
 
@@ -355,12 +353,12 @@ def test_figures_show_the_episode_that_is_given(run):
     drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
     assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy()) and "twin" in drawn
     assert any(word.startswith("Real and twin states, one flight") for word in draw(run.figure("states", flown)))
-    assert {"states", "actions", "learning_curves", "power_and_speed"} <= set(run.figure_names())
+    assert {"states", "learning_curves", "power_and_speed"} <= set(run.figure_names())
 
 
 def test_figures_call_a_flight_on_the_twin_so(run):
     flown = run.simulate(run.policy("model_based"), torch.full((2, 30, 1), 12.5), on="twin")
-    for name, title in {"states": "States", "actions": "Applied actions", "power_and_speed": "Power and speed"}.items():
+    for name, title in {"states": "States", "power_and_speed": "Power and speed"}.items():
         found = draw(run.figure(name, flown))
         assert f"{title}, flight on the twin" in found and "real" not in found
     assert not any(word.startswith("RMS") for word in draw(run.figure("states", flown)))

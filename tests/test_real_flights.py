@@ -106,7 +106,7 @@ def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
     with pytest.raises(ValueError, match="nobody knows the true closure of this run's real system"):
         finished.simulate(finished.policy("model_based"))
     assert finished.simulate(finished.policy("model_based"), on="twin").states.isfinite().all()
-    assert {"states", "actions", "flights"} <= set(finished.figure_names())
+    assert {"states", "flights"} <= set(finished.figure_names())
     assert "States, flight on the twin" in draw(finished.figure("states"))
 
 

@@ -43,7 +43,7 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     )
     assert {"J_p", "J_a_model_based", "J_a_model_free"} <= set(summary["unseen"])
     assert json.loads((tmp_path / "config.json").read_text())["episodes"] == 4
-    assert {"states.png", "actions.png"} <= {path.name for path in (tmp_path / "figures").iterdir()}
+    assert {"states.png", "learning_curves.png"} <= {path.name for path in (tmp_path / "figures").iterdir()}
     events = EventAccumulator(str(tmp_path))
     events.Reload()
     logged = [event.value for event in events.Scalars("twin/J_p after assimilation")]

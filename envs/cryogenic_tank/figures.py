@@ -1,25 +1,21 @@
-"""Figures of the cryogenic tank: its days in orbit, its heat exchanger, and an animation."""
+"""Figures of the cryogenic tank: its days in orbit and its heat exchanger."""
 
 from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from rt_torchrl.envs.cryogenic_tank.plant import BAND, CryogenicTank
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
+from rt_torchrl.figures.style import REFERENCE_LINE, SAMPLES, TWIN, array, caption
 from rt_torchrl.figures.training import closure_weights, tracked_weights
 
 POINTS = 720
 """Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
-PUFFS = 12
-"""Greatest number of drawn puffs of vented gas."""
 LABELS = {
     "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),
     "U_HX": ("heat exchanger $U_{HX}$ [W/(m² K)]", 1.0),
@@ -130,54 +126,3 @@ def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Ten
     """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
     return p - plant.valve_outlet(p, plant.opening(actions[:, 0])[0])
-
-
-@torch.no_grad()
-def scene(snapshot: Snapshot) -> Scene:
-    """The last real episode as an animation.
-
-    The tank shows the share of its volume that is liquid, the heat load as an arrow through the wall, and the vent flow
-    as puffs behind the valve, as many as its share of the greatest flow of the episode. Beside it stand pressure with
-    its set point, vent flow and load, with a cursor at the present time.
-    """
-    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
-    state = record.states[:-1]
-    pressure, fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
-    flow, load = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow), array(record.exogenous[:, 0])
-
-    around = np.linspace(0.0, 2.0 * np.pi, 181)
-
-    def draw(ax: Axes, k: int) -> str:
-        ax.set(xlim=(-1.9, 1.9), ylim=(-1.3, 2.3), aspect="equal")
-        ax.axis("off")
-        # From one edge of the surface along the wall to the other.
-        half = np.arccos(-level(fill[k]))
-        angle = np.linspace(-half, half, 91)
-        ax.fill(np.sin(angle), -np.cos(angle), color=style.FILTERED, alpha=0.8)
-        ax.plot(np.cos(around), np.sin(around), color=REAL, linewidth=3.0)
-        ax.plot([0.0, 0.0], [1.0, 1.35], color=REAL, linewidth=3.0)
-        count = round(PUFFS * flow[k] / (flow.max() or 1.0))
-        ax.plot([0.0], [1.35], marker="D", color=SAMPLES if count else REAL, markersize=8)
-        rise = np.arange(count) / PUFFS
-        puffs = 0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise
-        ax.plot(*puffs, "o", color="0.7", markersize=5, alpha=0.8)
-        units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
-        ax.quiver([-1.75], [0.0], [0.7 * load[k] / load.max()], [0.0], color=TWIN, width=0.02, **units)
-        ax.text(-1.85, -1.25, f"load {load[k]:.0f} W, {100.0 * fill[k]:.1f} % liquid", fontsize=9)
-        return f"{pressure[k]:.0f} kPa"
-
-    traces = {
-        "pressure $p$ [kPa]": (pressure, np.full_like(pressure, 1e-3 * plant.set_point)),
-        r"vent flow $\dot m_c$ [g/s]": (flow, None),
-        plant.inputs[0].label: (load, None),
-    }
-    return Scene(snapshot, draw, title="Cryogenic tank", size=(9.0, 5.2), traces=traces, width_ratios=(1.0, 1.5))
-
-
-def level(fill: float) -> float:
-    """Height of the liquid in a sphere of radius 1, from its centre, of which a share of the volume is filled.
-
-    The share is (1 + h)²(2 − h)/4.
-    """
-    heights = np.linspace(-1.0, 1.0, 401)
-    return float(np.interp(fill, 0.25 * (1.0 + heights) ** 2 * (2.0 - heights), heights))

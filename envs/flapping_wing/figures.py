@@ -1,4 +1,4 @@
-"""Figures of the flapping-wing drone: its flight, the polars of its wings, its policies, and an animation."""
+"""Figures of the flapping-wing drone: its flight, the polars of its wings, and its policies."""
 
 from typing import Any, cast
 
@@ -13,7 +13,6 @@ from torch import Tensor
 from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
 from rt_torchrl.evaluation.checks import visited_features as features_of
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
 from rt_torchrl.figures.training import contours
@@ -213,46 +212,3 @@ def control_surfaces(snapshot: Snapshot) -> Figure:
         contours(snapshot, k, {(0, 2): pair[0], (1, 3): pair[1]}, others=zero)
     style.legend_below(figure, [axes[0, 0]])
     return figure
-
-
-def scene(snapshot: Snapshot) -> Scene:
-    """The last real flight as an animation, in real time if it lasts five seconds.
-
-    The drone is drawn enlarged: its body, its stroke plane with the pitch β_w and a length proportional to A_φ, the
-    normal along which it is pushed, and the wing at its phase in the stroke. At 25 frames per second a beat of 20 Hz
-    looks like a beat of 5 Hz.
-    """
-    plant, place = cast(FlappingWing, snapshot.plant), array(snapshot.record.states)[:-1, :2]
-    actions, wind = array(snapshot.record.actions), array(snapshot.record.exogenous)[:, 0]
-
-    target = array(plant.target)
-    points = np.vstack([place, target])
-    low, high = points.min(0), points.max(0)
-    middle, half = 0.5 * (low + high), 0.6 * max((high - low).max(), 1e-3)  # with a margin for the drone
-
-    def draw(ax: Axes, k: int) -> str:
-        ends = zip(middle - half, middle + half, strict=True)
-        ax.set(**dict(zip(("xlim", "ylim"), ends, strict=True)), aspect="equal")
-        ax.set_xlabel(plant.states[0].label)
-        ax.set_ylabel(plant.states[1].label)
-        (A_phi, beta_w), t = actions[k], k * plant.dt
-        angle, reach = np.radians(beta_w), 0.15 * half * A_phi / plant.actions[0].high
-        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        wing = np.cos(2.0 * np.pi * plant.frequency * t) * along
-
-        def bar(first: np.ndarray, last: np.ndarray, **look: Any) -> None:
-            ax.plot(*np.stack([place[k] + reach * first, place[k] + reach * last], -1), solid_capstyle="round", **look)
-
-        ax.plot(*target, "*", color=style.REFERENCE, markersize=16, label="target")
-        ax.plot(*place[: k + 1].T, color="0.6", linewidth=1.4)
-        bar(-along, along, color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$")
-        bar(0.0 * across, across, color="0.45", linewidth=1.5, label="normal")
-        bar(0.0 * wing, wing, color=REAL, linewidth=2.5, label="wing")
-        ax.plot(*place[k], "o", color=REAL, markersize=6)
-        look: dict[str, Any] = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
-        ax.quiver([0.2], [0.93], [-wind[k]], [0.0], transform=ax.transAxes, **look)
-        text = f"headwind {round(wind[k], 1) + 0.0:.1f} m/s"
-        ax.text(0.2, 0.96, text, transform=ax.transAxes, ha="center", fontsize=9)
-        return rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
-
-    return Scene(snapshot, draw, title="Flight", size=(6.2, 6.4))

@@ -1,4 +1,4 @@
-"""Figures of the wind turbine: its set-points, its power coefficient, the agreement of its twin, and an animation."""
+"""Figures of the wind turbine: its set-points, its power coefficient, and the agreement of its twin."""
 
 from typing import Any, cast
 
@@ -10,9 +10,8 @@ from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import style
-from rt_torchrl.figures.animation import Scene, shown_samples
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import FILTERED, REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
+from rt_torchrl.figures.style import FILTERED, REAL, REFERENCE_LINE, TWIN, array, caption
 
 CONTOURS = (0.1, 0.2, 0.3, 0.4, 0.45)
 GREATEST_SHOWN = 0.1
@@ -118,56 +117,3 @@ def scatter(snapshot: Snapshot) -> Figure:
     ax.set_ylabel(r"twin $\omega_g$ [rad/s]")
     ax.legend(loc="upper left", fontsize=9, frameon=False)
     return figure
-
-
-TURN = 25.0
-"""Angle by which the rotor turns between two frames at rated speed [deg]; its true angle would seem to jump."""
-HUB, TIP = 90.0, 63.0
-"""Height of the hub and radius of the rotor [m]."""
-CHORD = 6.0
-"""Width of a drawn blade at zero pitch [m]; it shrinks by the cosine of the pitch."""
-ARROW = 3.0
-"""Length of the wind's arrow for each m/s [m]."""
-
-
-@torch.no_grad()
-def scene(snapshot: Snapshot) -> Scene:
-    """The last real episode as an animation.
-
-    The rotor is seen from the front. Its blades turn as much slower than the real ones as the episode is quicker, and
-    narrow with the pitch; the arrow is the wind. Beside it stand wind, generator speed, power and pitch, with the
-    references that the paper's cost follows and a cursor at the present time.
-    """
-    plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
-    state, wind, pitch = record.states[:-1], array(record.exogenous[:, 0]), array(record.actions[:, 1])
-    # The angle of a frame is the sum of what the frames before it have turned.
-    shown = shown_samples(len(state))
-    turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
-    angles = dict(zip(shown, np.radians(turned), strict=True))
-
-    omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
-
-    def draw(ax: Axes, k: int) -> str:
-        ax.set(xlim=(-95.0, 95.0), ylim=(-5.0, 165.0), aspect="equal")
-        ax.axis("off")
-        ax.axhline(0.0, color="0.6", linewidth=1.0)
-        ax.fill([-3.0, -2.0, 2.0, 3.0], [0.0, HUB, HUB, 0.0], color="0.75")
-        width = 0.5 * CHORD * np.cos(np.radians(pitch[k]))
-        outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
-        for number in range(3):
-            angle = angles[k] + 2.0 * np.pi * number / 3.0
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            ax.fill(*(outline @ turn + [0.0, HUB]).T, color=REAL)
-        ax.plot([0.0], [HUB], "o", color=style.REFERENCE, markersize=7)
-        units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
-        ax.quiver([-90.0], [150.0], [ARROW * wind[k]], [0.0], color=SAMPLES, width=0.012, **units)
-        ax.text(-90.0, 156.0, f"wind {wind[k]:.1f} m/s", fontsize=9)
-        return f"pitch {pitch[k]:.1f} deg"
-
-    traces = {
-        WIND_LABEL: (wind, None),
-        SPEED_LABEL: (array(omega_g), array(plant.reference_speed(state[:, 2]))),
-        "generator power [MW]": (array(power), 1e-6 * array(plant.reference_power(omega_g))),
-        PITCH_LABEL: (pitch, None),
-    }
-    return Scene(snapshot, draw, title="Wind turbine", size=(9.0, 5.6), traces=traces, width_ratios=(1.15, 1.0))

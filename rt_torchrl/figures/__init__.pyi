@@ -4,19 +4,16 @@ from .comparison import flights, unseen
 from .snapshot import Snapshot
 from .style import pixels, save_figure, save_pixels
 from .training import (
-    actions,
     closure_weights,
     exogenous,
     figures_of,
     learning_curves,
     policy_contours,
-    seconds,
     states,
 )
 
 __all__ = [
     "Snapshot",
-    "actions",
     "closure_weights",
     "exogenous",
     "figures_of",
@@ -26,7 +23,6 @@ __all__ = [
     "policy_contours",
     "save_figure",
     "save_pixels",
-    "seconds",
     "states",
     "unseen",
 ]

@@ -28,14 +28,6 @@ from rt_torchrl.steps.config import Role
 REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
 FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"
 ROLES: dict[Role, str] = {"model_based": "#0072B2", "model_free": "#E69F00"}
-STEPS = {
-    "interact": REAL,
-    "learn": ROLES["model_free"],
-    "inputs": SAMPLES,
-    "assimilate": TWIN,
-    "plan": ROLES["model_based"],
-    "switch": "#CC79A7",
-}
 
 LIMIT_LINE: dict[str, Any] = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
 REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterSciNotation, MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from rt_torchrl.figures import style
@@ -37,7 +37,7 @@ EVENTS: dict[str, dict[str, Any]] = {
     "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
 }
 WIDE_RANGE = 5.0
-"""Ratio of a weight's greatest to its least value from which its axis is logarithmic."""
+"""Ratio of the greatest to the least value from which an axis is logarithmic."""
 
 
 RESOLUTION = 81
@@ -51,15 +51,13 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     """The figures of a training by name; a figure with nothing to show is left out.
 
     ``exogenous`` needs an arm that trains a twin, and a plant with inputs. ``closure_weights`` needs an arm that trains
-    a twin, and episodes that report coefficients by name. ``learning_curves`` needs a reported episode, and
-    ``seconds`` an episode that reports them.
+    a twin, and episodes that report coefficients by name. ``learning_curves`` needs a reported episode.
     """
     twin = snapshot.large_scale is not None
-    chosen = [states, actions, policy_contours]
+    chosen = [states, policy_contours]
     chosen += [exogenous] if twin and snapshot.plant.inputs else []
     chosen += [closure_weights] if twin and tracked_weights(snapshot.episodes) else []
     chosen += [learning_curves] if snapshot.episodes else []
-    chosen += [seconds] if any(episode.get("seconds") for episode in snapshot.episodes) else []
     return {figure.__name__: figure(snapshot) for figure in chosen}
 
 
@@ -90,22 +88,6 @@ def states(snapshot: Snapshot) -> Figure:
         rms = 0.0 if rms <= 1e-10 * np.abs(real[:, k]).max() else rms
         caption(ax, signal.label, f"RMS {'diverges' if np.isnan(rms) else style.with_unit(rms, signal.unit)}")
     legend_below(figure, axes[:1])
-    return figure
-
-
-def actions(snapshot: Snapshot) -> Figure:
-    """Every applied action over time, held over each interval, with its limits."""
-    signals, applied = snapshot.plant.actions, array(snapshot.record.actions)
-    # Who acted in the record; the snapshot's live policy may have changed since then.
-    actor = (snapshot.episodes[-1].get("live") if snapshot.episodes else None) or snapshot.live
-    title, size = f"Applied actions, {style.episode(snapshot)}", (7.5, 1.2 + 2.0 * len(signals))
-    figure, axes, time = style.timeline(snapshot.plant, len(applied), len(signals), title=title, size=size)
-    look: dict[str, Any] = {"color": ROLES[actor], "linewidth": 1.3, "label": f"{role_name(actor)}, live"}
-    for k, (ax, signal) in enumerate(zip(axes, signals, strict=True)):
-        ax.step(time[:-1], applied[:, k], where="post", **look)
-        style.limits(ax, signal)
-        caption(ax, signal.label)
-    legend_below(figure, axes)
     return figure
 
 
@@ -175,27 +157,6 @@ def learning_curves(snapshot: Snapshot) -> Figure:
     return figure
 
 
-def seconds(snapshot: Snapshot) -> Figure:
-    """Wall-clock time of every episode, stacked by step in the order of the steps."""
-    spent = [episode.get("seconds") or {} for episode in snapshot.episodes]
-    steps = list(dict.fromkeys(step for episode in spent for step in episode))
-    figure, (ax,) = style.grid(1, title="Computing time per episode", size=(8.5, 4.2), xlabel="episode")
-    number, base = np.arange(len(spent)), np.zeros(len(spent))
-    for step in steps:
-        height = np.array([float(episode.get(step, 0.0)) for episode in spent])
-        ax.bar(
-            number, height, bottom=base, width=0.8, color=style.STEPS.get(step, "#F0E442"), label=step.replace("_", " ")
-        )
-        base += height
-    caption(ax, "wall-clock time [s]")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlim(-0.5, len(spent) - 0.5)
-    # The legend is reversed, so that its entries have the order of the stacked bars.
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside right upper", fontsize=9.5, frameon=False)
-    return figure
-
-
 @torch.no_grad()
 def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] | None = None) -> Figure:
     """Each named coefficient of the twin after every episode, with its initial and, if it is known, its true value.
@@ -222,8 +183,7 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
             ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
             ax.axhline(factor * true[name], label="true", **style.REFERENCE_LINE)
-        if _logarithmic(ax, WIDE_RANGE):
-            style.plain_numbers(ax)
+        _logarithmic(ax)
         caption(ax, label, f"{100.0 * (found[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
@@ -258,21 +218,13 @@ def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
     return np.array([np.nan if value is None else float(value) for value in values])
 
 
-def _logarithmic(ax: Axes, least_range: float = 1.0) -> bool:
-    """Make an axis that is :func:`fit_for_logarithms` logarithmic, and return whether it is."""
-    if not style.fit_for_logarithms(ax, least_range):
-        return False
+def _logarithmic(ax: Axes) -> None:
+    """Make an axis logarithmic whose values are positive and lie far apart."""
+    if not style.fit_for_logarithms(ax, WIDE_RANGE):
+        return
     ax.set_yscale("log")
-    if not style.fit_for_logarithms(ax, 10.0):
-        # Within a decade 4, 5, 6 read better than multiples of a power of ten.
-        for set_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-            set_formatter(StrMethodFormatter("{x:g}"))
-    else:
-        # An axis of about a decade needs numbers between the powers of ten.
-        ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
-    ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
-    ax.tick_params(which="minor", labelsize=8)
-    return True
+    if not style.fit_for_logarithms(ax, 1000.0):
+        style.plain_numbers(ax)
 
 
 def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:

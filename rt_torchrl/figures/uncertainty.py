@@ -1,11 +1,11 @@
-"""Figures of an identification from sensors: readings and replays, weights and their correlations."""
+"""Figures of an identification from sensors: readings and replays, and the correlations of the weights."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from rt_torchrl.figures import style
 from rt_torchrl.figures.style import REAL, TWIN, array, caption, legend_below, panels
-from rt_torchrl.fit.least_squares import Estimate, Identified
+from rt_torchrl.fit.least_squares import Identified
 from rt_torchrl.fit.uncertainty import Uncertainty
 
 
@@ -37,26 +37,6 @@ def twin_and_sensors(found: Identified) -> Figure:
         before, after = (style.with_unit(one.rms[k].item(), sensor.measurement.unit) for one in found.held_out)
         caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
     legend_below(figure, axes)
-    return figure
-
-
-def weights(estimate: Estimate) -> Figure:
-    """Every weight before and after, divided by its size after, with a bar of two standard errors.
-
-    A weight of which the records say nothing has no bar.
-    """
-    names = list(estimate.after)
-    figure, ((ax,),) = panels(1, title="Weights", size=(max(5.0, 1.5 + 0.8 * len(names)), 4.2))
-    before, after = (np.array(list(values.values())) for values in (estimate.before, estimate.after))
-    errors = np.array(list(estimate.uncertainty.standard_errors().values()))
-    errors = np.where(np.isfinite(errors), errors, np.nan)
-    unit, place = np.where(after == 0.0, 1.0, np.abs(after)), np.arange(len(names))
-    ax.plot(place, before / unit, "o", color=style.LIMITS, markersize=5, label="before")
-    bar = {"fmt": "o", "color": TWIN, "markersize": 5, "capsize": 4}
-    ax.errorbar(place, after / unit, 2.0 * errors / unit, label="after, two standard errors", **bar)
-    ax.set_xticks(place, names, rotation=0 if len(names) < 6 else 60)
-    caption(ax, "weight over its size after [-]")
-    legend_below(figure, [ax])
     return figure
 
 

@@ -5,7 +5,6 @@ import errno
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -95,7 +94,6 @@ class Run:
             1, each of whose batches is a whole episode of batch size ``1 n``.
         callbacks: functions that see the entries of all episodes after each one, and may end the training; see
             :data:`Callback`.
-        animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
         PlantContractError: before any work, if a plant breaks its contract in a way that is found at once;
@@ -121,14 +119,13 @@ class Run:
         referee: MakeReferee = make_referee,
         collector: MakeCollector = collector_of,
         callbacks: Sequence[Callback] = (),
-        animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
         self.asked, self.config = config, config.effective()
-        self.plant_figures, self.animate = plant_figures, animate
+        self.plant_figures = plant_figures
         self.ended: str | None = None
         self.callbacks = callbacks
         device = require_device(config.device)
@@ -274,8 +271,6 @@ class Run:
                 folder.mkdir(exist_ok=True)
                 for name, image in images.items():
                     figures.save_pixels(image, folder / f"{name}.png")
-                if self.animate:
-                    self.animate(snapshot, folder / "animation.gif")
                 dashboard.images(images, len(self.episodes) - 1)
         table = results_table(metrics)
         dashboard.results(options, metrics["summary"], table)

@@ -281,7 +281,7 @@ RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
 LEFT = (
     *("events.out.tfevents.*", "csv/scalars/**/*.csv", "csv/texts/*.txt"),
-    *("figures/*.png", "figures/animation.gif"),
+    "figures/*.png",
     *("checkpoint-*.pt", "checkpoint*.pt.damaged"),
     *WRITTEN,
 )
