@@ -19,7 +19,8 @@ PICTURES = {
 if __name__ == "__main__":
     for plant, names in PICTURES.items():
         folder = ROOT / "runs" / "gallery" / plant
-        options = ["--threads", "1", "--overwrite", "--log-dir", folder]
+        shutil.rmtree(folder, ignore_errors=True)
+        options = ["--threads", "1", "--log-dir", folder]
         subprocess.run([sys.executable, ROOT / "recipes" / f"{plant}.py", *options], check=True)
         for name in names:
             shutil.copyfile(folder / "figures" / name, ROOT / "docs" / "gallery" / f"{plant}_{name}")

@@ -24,7 +24,7 @@ if __name__ == "__main__":
 import torch
 
 from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
-from rt_torchrl.atomic_file import make_folder, write_atomically, write_results
+from rt_torchrl.atomic_file import make_folder, read_json, write_atomically, write_results
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.interruption import Interrupted, termination_as_interrupt
@@ -37,7 +37,7 @@ from rt_torchrl.steps.config import Arm, Role
 
 PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
 ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
-OWN = ("--seed", "--log-dir", "--resume", "--overwrite", "--threads", "--unseen-every", "--config")
+OWN = ("--seed", "--log-dir", "--resume", "--threads", "--unseen-every", "--config")
 """Options that the study gives every run itself."""
 EVERY = ("--threads", "1", "--unseen-every", "1", "--no-figures")
 QUICK_EFFORT = {"starts": 1, "approach": 100, "iterations": 20, "polish": 5}
@@ -186,7 +186,7 @@ class Training:
         recipe, mine = read_settings(self.folder).get("recipe"), settings_of(asked, "")["recipe"]["file"]
         if recipe and recipe.get("file") != mine:
             found.append(f"the recipe is {mine} here and was {recipe.get('file')} in the run")
-        metrics = read_json(self.folder / "metrics.json")
+        metrics = known(self.folder / "metrics.json")
         done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes
         if done > wanted:
             found.append(f"episodes is {wanted} here and was {done} in the run")
@@ -213,7 +213,7 @@ class Training:
                 raise
         if self.finished():
             return
-        if read_json(self.folder / "metrics.json") is None:
+        if known(self.folder / "metrics.json") is None:
             raise RuntimeError("the recipe has ended without results; see training.log")
         raise KeyboardInterrupt  # the run has taken the signal, and kept its episodes
 
@@ -254,7 +254,7 @@ class Search:
 
     def kept(self) -> dict[str, Any] | None:
         """What is kept, or None."""
-        return read_json(self.path)
+        return known(self.path)
 
     def finished(self) -> bool:
         """Whether the cost is kept."""
@@ -277,13 +277,12 @@ class Search:
         write_results(self.path, {"of": self.of(), **found})
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
+def known(path: Path) -> dict[str, Any] | None:
     """The object in a JSON file; None if the file is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        return read_json(path)
+    except ValueError:
         return None
-    return content if isinstance(content, dict) else None
 
 
 def in_a_worker(file: str, kind: str, task: dict[str, Any]) -> str | None:
@@ -440,7 +439,7 @@ def of_the_class(role: Role, config: RunConfig) -> bool:
 
 def main(config: Config) -> None:
     make_folder("log_dir", config.log_dir)
-    before = read_json(config.log_dir / "study.json")
+    before = known(config.log_dir / "study.json")
     if config.runs and before is not None and not before["config"]["runs"]:
         raise ValueError(f"log_dir={config.log_dir} holds a study of trainings; give the comparison another folder.")
     comparisons, failures = ([compare_runs(config.runs)], []) if config.runs else studied(config)

@@ -82,6 +82,21 @@ def write_json(path: Path, content: Any) -> None:
     write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        ValueError: if the file cannot be read, is damaged, or holds something else.
+    """
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged, or cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold an object.")
+    return content
+
+
 def finite(content: Any) -> Any:
     """The content as JSON has it: None for every number that is not finite, text for paths, objects for dataclasses."""
     if dataclasses.is_dataclass(content) and not isinstance(content, type):

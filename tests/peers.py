@@ -12,6 +12,7 @@ import importlib
 import inspect
 import json
 import operator
+import shutil
 import statistics
 import subprocess
 import sys
@@ -233,9 +234,10 @@ class Comparison:
         """The folder of the recipe's training with default options, and the seconds of its process."""
         folder = self.folder / f"run-{seed}"
         if not (folder / "seconds.json").exists():
-            folder.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(folder, ignore_errors=True)  # a training that was interrupted
+            folder.mkdir(parents=True)
             command = [sys.executable, str(RECIPES / f"{self.name}.py"), "--seed", str(seed), "--threads", "1"]
-            command += ["--real-unseen", str(self.judged), "--no-figures", "--log-dir", str(folder), "--overwrite"]
+            command += ["--real-unseen", str(self.judged), "--no-figures", "--log-dir", str(folder)]
             start = time.perf_counter()
             with (folder / "training.log").open("w") as log:
                 subprocess.run(command, check=True, stdout=log, stderr=log)

@@ -9,6 +9,7 @@ import argparse
 import json
 import math
 import shlex
+import shutil
 import statistics
 import subprocess
 import sys
@@ -115,9 +116,10 @@ def trained(options, seed, folder):
     """The run folder of a training."""
     run = folder / "run"
     if not (run / "metrics.json").exists():
-        run.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(run, ignore_errors=True)  # a training that was interrupted
+        folder.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(RECIPE), "--task", "engineering", "--seed", str(seed), "--threads", "1"]
-        command += ["--no-figures", "--log-dir", str(run), "--overwrite"]
+        command += ["--no-figures", "--log-dir", str(run)]
         with (folder / "training.log").open("w") as log:
             subprocess.run([*command, *shlex.split(options)], check=True, stdout=log, stderr=log)
     return run

@@ -7,6 +7,7 @@ interrupted; another folder is another measurement. It takes about 40 minutes on
 
 import argparse
 import json
+import shutil
 import statistics
 import subprocess
 import sys
@@ -49,12 +50,13 @@ def train(row: Row, seed: int, folder: Path) -> None:
     """Run the recipe, unless its results are there; ``seconds.json`` takes the seconds of the whole process."""
     if (folder / "seconds.json").exists():
         return
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)  # a training that was interrupted
+    folder.mkdir(parents=True)
     command = [sys.executable, str(RECIPES / f"{row.recipe}.py"), "--seed", str(seed), "--threads", "1"]
     command += ["--no-figures", "--log-dir", str(folder), *row.options]
     start = time.perf_counter()
     with (folder / "training.log").open("w") as log:
-        subprocess.run([*command, "--overwrite"], check=True, stdout=log, stderr=log)
+        subprocess.run(command, check=True, stdout=log, stderr=log)
     (folder / "seconds.json").write_text(json.dumps(time.perf_counter() - start))
 
 

@@ -128,7 +128,7 @@ def test_a_printed_training_begins(command, clone, monkeypatch):
     first = "rt_torchrl.algorithm.ReinforcementTwinning.episode"
     folder = re.search(r"(runs/wind_turbine/TIME-seed-0)/config\.json", command)
     if folder:  # the options of a run that is there
-        earlier = f"uv run recipes/wind_turbine.py --quick --overwrite --log-dir {folder[1]}"
+        earlier = f"uv run recipes/wind_turbine.py --quick --log-dir {folder[1]}"
         require_begun_here(earlier, clone, monkeypatch, first)
     require_begun_here(command, clone, monkeypatch, first)
 
@@ -169,7 +169,8 @@ def test_a_log_is_recorded_and_identified(clone):
 def test_a_policy_is_exported(formats, kinds, clone):
     (command,) = (c for c in commands() if "recipes/export.py" in c and c.endswith(f"--formats {formats}"))
     folder = re.search(r"runs/\S+", command).group()
-    done(f"{LAST}{folder} --overwrite", clone)  # a command before may have begun a run there
+    shutil.rmtree(clone / folder, ignore_errors=True)  # a command before may have begun a run there
+    done(f"{LAST}{folder}", clone)
     done(command, clone)
     assert kinds <= {path.suffix for path in (clone / folder / "exported").iterdir()}
 

@@ -186,7 +186,7 @@ def test_a_damaged_checkpoint_is_replaced_by_the_one_before(kept, numbers, tmp_p
             refusal = str(error)
         said, state = capsys.readouterr().out, plain(algorithm.state_dict())
         if refusal:
-            assert alone and "checkpoint.pt" in refusal and "--overwrite" in refusal
+            assert alone and "checkpoint.pt" in refusal and "choose another folder" in refusal
         elif len(episodes) == EPISODES:  # the damage has no effect on the content
             assert same(state, states[0]) and not said
         else:

@@ -362,7 +362,3 @@ def test_figures_call_a_flight_on_the_twin_so(run):
         found = draw(run.figure(name, flown))
         assert f"{title}, flight on the twin" in found and "real" not in found
     assert not any(word.startswith("RMS") for word in draw(run.figure("states", flown)))
-
-
-def test_the_table_has_a_row_for_each_episode(run):
-    assert run.table()["real_cost"].tolist() == pytest.approx([0.1, 0.09])

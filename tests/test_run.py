@@ -50,17 +50,13 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     # TensorBoard keeps single precision.
     records = metrics["episodes"]
     assert logged == pytest.approx([record["J_p"] for record in records], rel=1e-6)
-    assert {f"closure/{name}" for name in records[0]["closure"]} <= set(events.Tags()["histograms"])
     for role in ("model-based", "model-free"):
         flown = [one["real_cost"] for one in records if one["live"] == role.replace("-", "_")]
         tag = f"cost/real episode ({role})"
         assert bool(flown) == (tag in events.Tags()["scalars"])
         assert not flown or [event.value for event in events.Scalars(tag)] == pytest.approx(flown, rel=1e-6)
-        assert f"weights of {role}/gain" in events.Tags()["histograms"]
-    (drawn,) = events.Histograms("unseen episodes/J_p")
     each = summary["unseen"]["J_p_each"]
-    assert drawn.histogram_value.num == len(each) == 3
-    assert sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
+    assert len(each) == 3 and sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
 
 
 def test_a_run_without_figures_has_the_same_results(tmp_path):

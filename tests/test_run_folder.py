@@ -55,7 +55,7 @@ def contents(path):
 def test_a_folder_in_use_is_refused_until_it_is_let_go(tmp_path):
     folder = RunFolder(RunConfig(log_dir=tmp_path), "p")
     with pytest.raises(ValueError, match="log_dir=.* is in use by another training"):
-        RunFolder(RunConfig(log_dir=tmp_path, overwrite=True), "p")
+        RunFolder(RunConfig(log_dir=tmp_path), "p")
     folder.release()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
 
@@ -85,15 +85,6 @@ def test_what_killed_writers_left_is_removed(tmp_path):
     (tmp_path / ".checkpoint.pt.1-ab.partial").touch()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
     assert not list(tmp_path.glob(".*.partial"))
-
-
-def test_resume_and_overwrite_exclude_each_other(tmp_path):
-    begun(tmp_path)
-    (tmp_path / "checkpoint.pt").write_text("episodes")
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match="resume and overwrite exclude each other"):
-        RunFolder(RunConfig(log_dir=tmp_path, resume=True, overwrite=True), "p")
-    assert contents(tmp_path) == before
 
 
 def changed_twinning():
@@ -135,61 +126,11 @@ def test_what_cannot_be_resumed_is_refused(tmp_path):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
     begun(tmp_path)
     (tmp_path / "weights.pt").touch()
-    with pytest.raises(ValueError, match="finished run without its checkpoint.pt.*--overwrite"):
+    with pytest.raises(ValueError, match="finished run without its checkpoint.pt.*another folder"):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(ValueError, match="config.json is damaged"):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
-
-
-class Killed(BaseException):
-    """What stops a process."""
-
-
-def test_an_overwrite_that_is_killed_leaves_no_results_beside_other_options(tmp_path, monkeypatch):
-    """Killed before every removal in turn, and before the new options are written."""
-    unlink, moments = Path.unlink, 0
-
-    def until(moment):
-        calls = iter(range(moment))
-
-        def mortal(self, missing_ok=False):
-            if self.name.startswith("."):
-                return unlink(self, missing_ok=missing_ok)
-            if next(calls, None) is None:
-                raise Killed
-            return unlink(self, missing_ok=missing_ok)
-
-        return mortal
-
-    for moment in range(20):
-        path = tmp_path / str(moment)
-        begun(path, seed=1)
-        (path / "figures").mkdir()
-        old = ["metrics.json", "weights.pt", "checkpoint.pt", "figures/unseen.png", "events.out.tfevents.1"]
-        for name in (*old, "training.log"):
-            (path / name).write_text("of seed 1")
-        folder = RunFolder(RunConfig(log_dir=path, overwrite=True, seed=2), "p")
-        assert (path / "checkpoint.pt").exists()  # nothing goes before the training begins
-        with monkeypatch.context() as patched:
-            patched.setattr(Path, "unlink", until(moment))
-            try:
-                folder.begin(RunConfig())
-            except Killed:
-                moments += 1
-                assert read_seed(path) in (1, None)
-                continue
-            finally:
-                folder.release()
-        assert read_seed(path) == 2 and not any((path / name).exists() for name in old)
-        assert (path / "training.log").exists()
-        break
-    assert moments == 6  # five files and the options
-
-
-def read_seed(path):
-    file = path / "config.json"
-    return json.loads(file.read_text())["seed"] if file.exists() else None
 
 
 def test_what_ran_is_kept_for_every_start(tmp_path):
@@ -417,7 +358,7 @@ def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_pat
     before = (tmp_path / "config.json").read_bytes()
     for length in generator.integers(0, len(whole), 5):
         (tmp_path / "checkpoint.pt").write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged.*train anew in this folder, use --overwrite"):
+        with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged.*train anew, choose another folder"):
             small_run(tmp_path, resume=True, **QUICK)
     middle = bytearray(whole)
     middle[whole.index(b"PK\x03\x04", len(whole) // 2) - 100] ^= 1  # within a tensor: parts follow each other
@@ -513,7 +454,7 @@ def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkey
         patched.setattr(MakePlan, "forward", killed)
         with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
             small_run(tmp_path, episodes=1, **QUICK).train()
-    with pytest.raises(ValueError, match="holds a run already.*--resume it, or --overwrite it"):
+    with pytest.raises(ValueError, match="holds a run already; --resume it, or choose another folder"):
         small_run(tmp_path, episodes=1, **QUICK)
     resumed = small_run(tmp_path, episodes=1, resume=True, **QUICK).train()
     assert "has no episode done yet: it starts from its beginning" in capsys.readouterr().out

@@ -236,16 +236,6 @@ def test_columns_of_a_log_may_have_other_names(tmp_path):
     assert training(tmp_path / "run", start=str(path), log=reads).algorithm.start()["start_cost"] > 0.0
 
 
-def test_a_run_goes_on_in_its_own_place(tmp_path):
-    training(tmp_path, start="controller").train()
-    known = load_run(tmp_path)
-    again = training(tmp_path, start=str(tmp_path), overwrite=True)
-    assert len(again.train()["episodes"]) == 2
-    found = again.algorithm
-    found.start()
-    assert clones(found.policies["model_based"], known.policy("model_based"))
-
-
 def test_model_predictive_control_flies_first(tmp_path):
     found = training(tmp_path, start="mpc", seed=5).algorithm
     report = found.start()

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import importlib
 import inspect
-import json
 import logging
 import os
 import pkgutil
@@ -20,11 +19,12 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 import rt_torchrl.envs
+from rt_torchrl.atomic_file import read_json
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.console import HELP, PACKAGE
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, OF_THE_CALL, as_written, module_of, named
+from rt_torchrl.runs.settings import BESIDE, FILE, OF_THE_CALL, as_written, module_of, named
 
 Configuration = TypeVar("Configuration")
 
@@ -88,8 +88,8 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
     """The configuration that a command line asks for.
 
     The command line of a recipe is read twice, because the defaults of some options depend on other options; see
-    :meth:`RunConfig.defaults`. Options that are given stay as they are. The help shows the defaults that hold beside
-    the options that are given.
+    :meth:`RunConfig.defaults`. Those of a run that goes on are its own options. Options that are given stay as they
+    are. The help shows the defaults that hold beside the options that are given.
 
     Args:
         config_class: class of the configuration.
@@ -124,7 +124,10 @@ def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bo
     """The defaults of all options beside those that are given, with which help is asked for or not."""
     try:
         config = tyro.cli(config_class, args=words, console_outputs=not helped)
-        return config.defaults() if config.config is None else of_file(config.config, config)
+        begun = None if config.log_dir is None else config.log_dir / FILE
+        resumed = begun if config.resume and begun and begun.is_file() else None
+        file = config.config or resumed
+        return config.defaults() if file is None else of_file(file, config)
     except (SystemExit, ValueError, OSError):
         if helped:  # beside words that cannot be carried out, too
             return config_class().defaults()
@@ -140,28 +143,20 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
         ValueError: if the file cannot be read, is that of another recipe, or holds an option that does not exist or a
             value that it does not take.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-        if text.startswith("\ufeff"):
-            raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one.")
-        found = json.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"config={path} cannot be read: {error}") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"config={path} must hold an object with options, such as config.json of a run.")
+    found = read_json(path)
     recipe: Any = {} if found.get("recipe") is None else found["recipe"]
     made = recipe.get("file") if isinstance(recipe, dict) else 0
     if not isinstance(made, str | None):
-        raise ValueError(f"config={path}: its recipe is {recipe!r}; it must be an object, as in config.json of a run.")
+        raise ValueError(f"{path}: its recipe is {recipe!r}; it must be an object, as in config.json of a run.")
     mine = getattr(sys.modules[type(asked).__module__], "__file__", None)
     if made and mine and Path(made).name != Path(mine).name:
-        raise ValueError(f"config={path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
+        raise ValueError(f"{path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
     options = {name: value for name, value in found.items() if name not in (*BESIDE, *OF_THE_CALL)}
     try:
         read = read_options(type(asked), _over(as_written(asked.defaults()), options))
         return dataclasses.replace(read, config=None, log_dir=None)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"config={path}: {error}") from error
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _over(under: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -28,8 +28,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory, TwinFlight
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:
-    import pandas
-    from matplotlib.figure import Figure  # only their types: who reads weights needs neither
+    from matplotlib.figure import Figure  # only its type: who reads weights needs no Matplotlib
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,18 +78,6 @@ class LoadedRun:
     def _only_on_the_twin(self) -> bool:
         """Whether nobody knows the true closure of the real system."""
         return on_the_twin(self.metrics["summary"]["unseen"])
-
-    def table(self) -> "pandas.DataFrame":
-        """The episodes as a table: a row for each, a column for each entry; nested entries are ``seconds.plan``.
-
-        Raises:
-            ImportError: without pandas, which the extra ``logs`` installs; ``metrics["episodes"]`` needs nothing.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("table needs pandas: install rt_torchrl[logs], or read metrics['episodes'].") from error
-        return pandas.json_normalize(self.metrics["episodes"]).set_index("episode")
 
     @torch.no_grad()
     def simulate(

@@ -1,10 +1,10 @@
 """The file ``metrics.json`` of a run folder: how it is read, and what the policies of the run have cost where."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl.atomic_file import read_json
 from rt_torchrl.steps.config import Role
 
 
@@ -17,17 +17,13 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     file = folder / "metrics.json"
     if not file.is_file():
         raise ValueError(f"the run in {folder} has no metrics.json: it is not finished; go on with it by --resume.")
-    try:
-        metrics: Any = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged, or cannot be read: {error}") from error
-    given = metrics if isinstance(metrics, dict) else {}
-    episodes, summary = given.get("episodes"), given.get("summary")
+    metrics = read_json(file)
+    episodes, summary = metrics.get("episodes"), metrics.get("summary")
     if not (isinstance(episodes, list) and all(isinstance(e, dict) for e in episodes) and isinstance(summary, dict)):
         raise ValueError(
             f"{file} is damaged: it must be an object with episodes, a list of objects, and summary, an object."
         )
-    return given
+    return metrics
 
 
 def on_the_twin(unseen: Mapping[str, Any]) -> bool:

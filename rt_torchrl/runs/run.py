@@ -22,7 +22,7 @@ from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termi
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import real_side, results
 from rt_torchrl.runs.command_line import quieten_libraries
-from rt_torchrl.runs.dashboard import Dashboard, Progress, make_loggers
+from rt_torchrl.runs.dashboard import Dashboard, Progress
 from rt_torchrl.runs.real_side import (
     RealFlights,
     end_operation,
@@ -35,7 +35,6 @@ from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
-from rt_torchrl.runs.settings import as_written, flat
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
 from rt_torchrl.steps.plan import MakePlanner, make_planner
@@ -236,10 +235,7 @@ class Run:
 
     def _train(self) -> dict[str, Any]:
         self._held.begin(self.config)
-        options = flat(as_written(self.config))
-        loggers = make_loggers(self.config.loggers, self.folder, self.algorithm.twin.plant.name)
-        dashboard = Dashboard(self.folder, loggers)
-        dashboard.settings(options)
+        dashboard = Dashboard(self.folder)
         with Progress(self.config.episodes, len(self.episodes)) as bar:
             bar.doing("checking the gradient")
             # Model predictive control has no weights of its own whose gradient could be checked.
@@ -273,7 +269,7 @@ class Run:
                     figures.save_pixels(image, folder / f"{name}.png")
                 dashboard.images(images, len(self.episodes) - 1)
         table = results_table(metrics)
-        dashboard.results(options, metrics["summary"], table)
+        dashboard.results(metrics["summary"], table)
         dashboard.close()
         print(table)
         print(f"results in {self.folder}\n{next_steps(metrics, self.folder, self.config)}")
@@ -320,7 +316,7 @@ class Run:
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
-        dashboard.episode(record, self.algorithm.policies)
+        dashboard.episode(record)
         due = self.config.figures and len(self.episodes) % FIGURES_EVERY == 0
         if due and len(self.episodes) < self.config.episodes:
             safe_point()

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import field
 from pathlib import Path
@@ -34,11 +33,6 @@ from rt_torchrl.trajectories.rollout import Engine
 Callback = Callable[[Sequence[dict[str, Any]]], str | None]
 """Function of the entries of all episodes so far, as in ``metrics.json``; it returns why the training should end, or
 None to go on."""
-
-
-LoggerName = Literal["csv", "wandb", "mlflow"]
-PACKAGES: tuple[LoggerName, ...] = ("wandb", "mlflow")
-"""Loggers that need the package of their name."""
 
 
 SPREAD_OF_IMITATION = 0.02
@@ -81,10 +75,9 @@ class RunConfig:
             is fitted to it, and the policies imitate the actions in it. random: random weights.
         log: how the log is read that the training begins with.
         config: file with options, such as config.json of a run, which then runs again; options that are given beside it
-            replace those of the file, and log_dir, resume and overwrite are never taken from it.
+            replace those of the file, and log_dir and resume are never taken from it.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
-        resume: whether to go on from the checkpoint in log_dir.
-        overwrite: whether to replace the files that an earlier run left in log_dir.
+        resume: whether to go on from the checkpoint in log_dir, with the options of its run.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
             unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end, in simulation. Those of a
@@ -101,8 +94,6 @@ class RunConfig:
             them a training among many ends sooner.
         unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
             is judged only at the end.
-        loggers: loggers of TorchRL to write the curves to beside TensorBoard: csv (into csv/ of the run folder), wandb
-            (Weights & Biases) or mlflow, of which the latter two need their packages.
         noise: standard deviation of the real system's sensors, as a share of the value that they read.
         asynchronous: whether the real system operates on while the algorithm learns; docs/connect_your_machine.md.
         operation: how it operates then.
@@ -126,7 +117,6 @@ class RunConfig:
     config: File | None = None
     log_dir: File | None = None
     resume: bool = False
-    overwrite: bool = False
     quick: bool = False
     unseen: Annotated[int, Field(ge=2)] = 20
     real_unseen: Count = 0
@@ -134,7 +124,6 @@ class RunConfig:
     reference: bool = False
     figures: bool = True
     unseen_every: Count = 0
-    loggers: tuple[LoggerName, ...] = ()
     noise: NotNegative = 0.0
     asynchronous: bool = False
     operation: OperationConfig = field(default_factory=OperationConfig)
@@ -142,9 +131,6 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         require_checked(type(self))
-        for logger in self.loggers:
-            if logger in PACKAGES and importlib.util.find_spec(logger) is None:
-                raise ValueError(f"loggers={logger!r} needs a package that is not installed: pip install {logger}.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.real_unseen == 1:  # no mean of one episode has a confidence interval

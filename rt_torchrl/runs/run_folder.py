@@ -147,7 +147,7 @@ NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
 """Name of an earlier checkpoint."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk and of a used quota."""
-ANEW = "To train anew in this folder, use --overwrite."
+ANEW = "To train anew, choose another folder."
 
 
 def save_checkpoint(path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> str | None:
@@ -278,14 +278,8 @@ def _keep(path: Path, episodes: int) -> None:
 
 
 RESULTS = ("metrics.json", "weights.pt")
-WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
-LEFT = (
-    *("events.out.tfevents.*", "csv/scalars/**/*.csv", "csv/texts/*.txt"),
-    "figures/*.png",
-    *("checkpoint-*.pt", "checkpoint*.pt.damaged"),
-    *WRITTEN,
-)
-"""Files of a run, in the order of their removal: ``config.json`` comes last, because it tells what the others are."""
+WRITTEN = (*RESULTS, CHECKPOINT, FILE)
+"""Files that say that a folder holds a run."""
 
 
 class RunFolder:
@@ -298,15 +292,11 @@ class RunFolder:
         plant: name of the run's plant.
 
     Raises:
-        ValueError: if the folder cannot be written or is in use; if it holds a run and neither ``resume`` nor
-            ``overwrite`` is asked for; if it is to be resumed and holds no run with these options.
+        ValueError: if the folder cannot be written or is in use; if it holds a run and ``resume`` is not asked for; if
+            it is to be resumed and holds no run with these options.
     """
 
     def __init__(self, config: RunConfig, plant: str):
-        if config.resume and config.overwrite:
-            raise ValueError(
-                "resume and overwrite exclude each other: one goes on with the run in log_dir, the other removes it."
-            )
         self._config, self._plant = config, plant
         self.path = self._writable()
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
@@ -357,11 +347,8 @@ class RunFolder:
 
     def _require_own(self) -> None:
         if not self._config.resume:
-            if not self._config.overwrite and any((self.path / name).exists() for name in WRITTEN):
-                raise ValueError(
-                    f"log_dir={self.path} holds a run already; choose another folder, or --resume it, or --overwrite "
-                    "it."
-                )
+            if any((self.path / name).exists() for name in WRITTEN):
+                raise ValueError(f"log_dir={self.path} holds a run already; --resume it, or choose another folder.")
             return
         if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
@@ -369,7 +356,7 @@ class RunFolder:
         if not has_checkpoint(self.checkpoint) and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(
                 f"log_dir={self.path} holds a finished run without its {self.checkpoint.name}: there is nothing to go "
-                "on with. To train anew in this folder, use --overwrite."
+                f"on with. {ANEW}"
             )
 
     @property
@@ -389,9 +376,7 @@ class RunFolder:
         return (self.path / FILE).is_file()
 
     def begin(self, effective: RunConfig) -> None:
-        """Remove the files that are to be overwritten, then write ``config.json``.
-
-        In this order the results of one run never lie beside the options of another.
+        """Write ``config.json``.
 
         Args:
             effective: options that the run carries out.
@@ -399,8 +384,4 @@ class RunFolder:
         Raises:
             OSError: if the folder cannot be written.
         """
-        if self._config.overwrite:
-            for pattern in LEFT:
-                for old in self.path.glob(pattern):
-                    old.unlink(missing_ok=True)
         write_settings(self.path, self._config, effective, self._plant)

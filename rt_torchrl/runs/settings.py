@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rt_torchrl.atomic_file import write_atomically
+from rt_torchrl.atomic_file import read_json, write_atomically
 from rt_torchrl.runs.run_config import RunConfig
 
 FILE = "config.json"
@@ -60,11 +60,8 @@ def read_settings(folder: Path) -> dict[str, Any]:
             f"{folder} is no run folder: it has no {FILE}. Give the folder that a recipe printed at its end, such "
             "as runs/wind_turbine/TIME-seed-0."
         )
-    try:
-        settings = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
-    if not isinstance(settings, dict) or not isinstance(settings.get("plant"), str):
+    settings = read_json(file)
+    if not isinstance(settings.get("plant"), str):
         raise ValueError(f"{file} is not that of a run: it does not name a plant.")
     return settings
 
@@ -122,9 +119,9 @@ def _origin(config_class: type) -> dict[str, str | None]:
 
 
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
-OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
+OF_THE_CALL = ("config", "log_dir", "resume")
 """Options that a file of options never gives."""
-BESIDE_TRAINING = {"figures", "reference", "loggers", "threads", *OF_THE_CALL}
+BESIDE_TRAINING = {"figures", "reference", "threads", *OF_THE_CALL}
 """Options of the place, the reports and the speed of a run, under which it trains and costs the same."""
 HARMLESS = {*BESIDE_TRAINING, "episodes", "unseen_every", "real_unseen"}
 """Options that may differ when a run is resumed: these and those of its length."""
