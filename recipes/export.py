@@ -51,8 +51,7 @@ class Config:
         output: folder for the files; by default RUN/exported.
         name: name of the files and of the C function, to which _controller, _discon or _twin is added; by default
             PLANT_ROLE, and PLANT for the twin.
-        recipe: recipe that made the run, as its file or as package.module:Config; by default the recipe that the run
-            names or, for a run of version 0.1, the recipe beside this file with the name of the plant.
+        recipe: file of the recipe that made the run; by default the one that the run names.
     """
 
     run: Annotated[Path, Positional]

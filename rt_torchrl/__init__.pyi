@@ -81,7 +81,6 @@ from .runs.run import Run
 from .runs.run_config import Preset, RunConfig, require_device
 from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
-from .export.exported_policy import ExportedPolicy, load_policy
 from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export.discon import export_discon
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
@@ -119,7 +118,6 @@ __all__ = [
     "ExogenousConfig",
     "ExpectedCost",
     "ExplorationConfig",
-    "ExportedPolicy",
     "ExtendedClosure",
     "Extension",
     "FMUEnvironment",
@@ -216,7 +214,6 @@ __all__ = [
     "export_twin",
     "export_twin_fmu",
     "identification_cost",
-    "load_policy",
     "load_run",
     "main_of",
     "read_log",

@@ -107,8 +107,7 @@ def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]
         for marker, chosen in zip(MARKERS, kinds.values(), strict=False):
             ax.plot(place[chosen], found[chosen], marker, markeredgewidth=0.0, **look)
         ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
-    if style.fit_for_logarithms(ax, WIDEST_LINEAR):
-        ax.set_yscale("log")
+    style.logarithmic_if_wide(ax, WIDEST_LINEAR)
     # Names take two lines, because four of them beside each other are wider than a panel.
     ax.set_xticks(range(len(values)), [who.replace("_", "-\n") for who in values])
     ax.set_xlim(-0.6, len(values) - 0.4)

@@ -29,6 +29,8 @@ REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
 FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"
 ROLES: dict[Role, str] = {"model_based": "#0072B2", "model_free": "#E69F00"}
 
+WIDE_RANGE = 5.0
+"""Ratio of the greatest to the least value from which an axis is logarithmic."""
 LIMIT_LINE: dict[str, Any] = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
 REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
 CLOSURE_LINES: dict[str, Any] = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
@@ -161,6 +163,15 @@ def fit_for_logarithms(ax: Axes, least_range: float) -> bool:
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
     values = values[np.isfinite(values)]
     return values.size > 0 and values.min() > 0.0 and values.max() >= least_range * values.min()
+
+
+def logarithmic_if_wide(ax: Axes, least_range: float = WIDE_RANGE) -> None:
+    """Make an axis logarithmic whose values are positive and lie far apart."""
+    if not fit_for_logarithms(ax, least_range):
+        return
+    ax.set_yscale("log")
+    if not fit_for_logarithms(ax, 1000.0):
+        plain_numbers(ax)
 
 
 def plain_numbers(ax: Axes) -> None:

@@ -36,8 +36,6 @@ EVENTS: dict[str, dict[str, Any]] = {
     "swap": {"color": "0.35", "linewidth": 1.2, "linestyle": "-", "label": "swap"},
     "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
 }
-WIDE_RANGE = 5.0
-"""Ratio of the greatest to the least value from which an axis is logarithmic."""
 
 
 RESOLUTION = 81
@@ -149,7 +147,7 @@ def learning_curves(snapshot: Snapshot) -> Figure:
         for key, look in curves.items():
             if np.isfinite(column := _column(episodes, key)).any():
                 ax.plot(np.arange(len(episodes)), column, linewidth=1.4, markersize=4, **look)
-        _logarithmic(ax)
+        style.logarithmic_if_wide(ax)
         legend_above(ax)
         _draw_events(ax, episodes)
         caption(ax, name)
@@ -183,7 +181,7 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
             ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
             ax.axhline(factor * true[name], label="true", **style.REFERENCE_LINE)
-        _logarithmic(ax)
+        style.logarithmic_if_wide(ax)
         caption(ax, label, f"{100.0 * (found[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
@@ -216,15 +214,6 @@ def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
     """One value per episode; nan in an episode that does not report it."""
     values = (episode.get(key) for episode in episodes)
     return np.array([np.nan if value is None else float(value) for value in values])
-
-
-def _logarithmic(ax: Axes) -> None:
-    """Make an axis logarithmic whose values are positive and lie far apart."""
-    if not style.fit_for_logarithms(ax, WIDE_RANGE):
-        return
-    ax.set_yscale("log")
-    if not style.fit_for_logarithms(ax, 1000.0):
-        style.plain_numbers(ax)
 
 
 def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:

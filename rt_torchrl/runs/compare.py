@@ -24,8 +24,6 @@ ROUNDING = 1e-6
 """Relative difference of a controller's costs on the same episodes that counts as rounding."""
 APART = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
-WIDEST_LINEAR = 5.0
-"""Ratio of the greatest to the least cost above which the axis of a panel is logarithmic."""
 DEAREST_SHOWN = 10.0
 """Greatest cost that a panel shows, over the costs of controllers, of the optimum and of the first row at the end."""
 COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
@@ -50,8 +48,6 @@ class FinishedRun:
         merit: mean of each of the plant's own quantities under that policy.
         controllers: J_a of each classical controller, mean over the unseen episodes.
         controllers_merit: the plant's own quantities of each classical controller.
-        alarms: number of episodes with an alarm.
-        swaps: number of changes of roles.
         seconds: time of the six steps in all episodes [s].
     """
 
@@ -66,8 +62,6 @@ class FinishedRun:
     merit: dict[str, float]
     controllers: dict[str, float]
     controllers_merit: dict[str, dict[str, float]]
-    alarms: int
-    swaps: int
     seconds: float
 
     @property
@@ -108,8 +102,6 @@ class FinishedRun:
             merit=_means(unseen["merit"][live]),
             controllers={name: statistics.fmean(_numbers(unseen["costs"][name])) for name in unseen["baselines"]},
             controllers_merit={name: _means(judged["merit"]) for name, judged in unseen["baselines"].items()},
-            alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
-            swaps=sum(episode.get("event") == "swap" for episode in episodes),
             seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),
         )
 
@@ -139,13 +131,6 @@ class Row:
         return {run.seed: sum(run.real) for run in self.runs}
 
     @property
-    def regret(self) -> list[float] | None:
-        """What each run has paid beyond as many episodes of the optimum."""
-        if self.optimum is None:
-            return None
-        return [sum(run.real) - len(run.real) * self.optimum for run in self.runs]
-
-    @property
     def episodes_to_optimum(self) -> list[float] | None:
         """Number of real episodes until the live policy of each run is near the optimum; infinite for never."""
         if self.optimum is None or not all(run.judged for run in self.runs):
@@ -168,10 +153,7 @@ class Row:
             "optimum": self.optimum,
             "paid": spread(list(self.paid.values())),
             "paid_ratio": paired_ratio(self.paid, first.paid) if same else None,
-            "regret": spread(self.regret),
             "episodes_to_optimum": spread(self.episodes_to_optimum),
-            "alarms": spread([float(run.alarms) for run in self.runs]),
-            "swaps": spread([float(run.swaps) for run in self.runs]),
             "seconds": spread([run.seconds for run in self.runs]),
             "merit": {name: statistics.median(run.merit[name] for run in self.runs) for name in self.runs[0].merit},
             "curves": [run.curve for run in self.runs],
@@ -259,20 +241,19 @@ class Comparison:
                     with_interval(row["J_a_ratio"]),
                     with_range(row["paid"]),
                     with_interval(row["paid_ratio"]),
-                    with_range(row["regret"]),
                     with_range(row["episodes_to_optimum"]).replace("inf", "never"),
-                    *(with_range(row[key]) for key in ("alarms", "swaps", "seconds")),
+                    with_range(row["seconds"]),
                 ]
             )
             merits[name] = row["merit"]
         for name, (cost, merit) in self.controllers().items():
-            lines.append([name, "", f"{cost:.4g}", *[""] * 9])
+            lines.append([name, "", f"{cost:.4g}", *[""] * 6])
             merits[name] = merit
         optima = {row.optimum: row.name for row in reversed(self.rows) if row.optimum is not None}
         for cost, name in reversed(optima.items()):
-            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 9])
+            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 6])
         header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
-        header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "role changes", "seconds"]
+        header += [f"Σ over {first}", "episodes to 110 %", "seconds"]
         kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
         tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
         if quantities := list(self.rows[0].runs[0].merit):
@@ -396,7 +377,7 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
 
 def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) -> None:
     """The rows of one task of one system."""
-    from rt_torchrl.figures.style import REFERENCE_LINE, caption, plain_numbers
+    from rt_torchrl.figures.style import REFERENCE_LINE, caption, logarithmic_if_wide
 
     known, medians, every = [], {}, []
     for row in rows:
@@ -424,15 +405,7 @@ def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) ->
         dearer = [name for name, median in medians.items() if median.min() > top]
         note = f"up to {1.05 * shown.max():.2g}" + (f"; above: {', '.join(dearer)}" if dearer else "")
     caption(ax, f"{title}: $J_a$", note)
-    shown = shown[np.isfinite(shown)]
-    if not len(shown):
-        return
-    if shown.min() > 0.0 and shown.max() > WIDEST_LINEAR * shown.min():
-        ax.set_yscale("log")
-        plain_numbers(ax)
-        ax.set_ylim(bottom=0.9 * shown.min())
-    else:
-        ax.set_ylim(bottom=shown.min() - 0.05 * (shown.max() - shown.min()))
+    logarithmic_if_wide(ax)
 
 
 def _numbers(values: Iterable[float | None]) -> list[float]:

@@ -3,9 +3,7 @@
 import ast
 import difflib
 import runpy
-import shutil
 import sys
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -80,22 +78,13 @@ def call_of(name: str) -> str:
 def listing() -> str:
     """The recipes with what each one is for."""
     known = recipes()
-    names = [name for name in FIRST if name in known] + [name for name in known if name not in FIRST]
-    width, columns = max(map(len, names), default=0), shutil.get_terminal_size().columns
-    rows = [
-        textwrap.fill(
-            purpose(known[name]),
-            max(columns, 2 * width),
-            initial_indent=f"  {name:{width}}  ",
-            subsequent_indent=" " * (width + 4),
-        )
-        for name in names
-    ]
+    names = sorted(known, key=lambda name: name not in FIRST)
+    width = max(map(len, names), default=0)
     return "\n".join(
         [
             f"usage: {PROGRAM} RECIPE [OPTIONS]",
             "",
-            *rows,
+            *(f"  {name:{width}}  {purpose(known[name])}" for name in names),
             f"  {'FILE.py':{width}}  A recipe of your own.",
             "",
             f"{PROGRAM} RECIPE --help lists the options of a recipe.",

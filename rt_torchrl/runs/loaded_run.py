@@ -19,7 +19,7 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.metrics import on_the_twin, read_metrics
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant, worn_closure
 from rt_torchrl.runs.run_folder import load_tensors
-from rt_torchrl.runs.settings import BESIDE, class_of, named, read_settings, require_config
+from rt_torchrl.runs.settings import BESIDE, class_of, read_settings, require_config
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
@@ -232,8 +232,8 @@ def load_run(
 
     Args:
         folder: the run folder, with ``config.json`` and ``weights.pt``.
-        recipe: the recipe, if it has moved or the run does not name it: its file, ``package.module:Config``, or the
-            class itself; by default the recipe that the run names.
+        recipe: the recipe, if it has moved or the run does not name it: its file, or the class itself; by default the
+            recipe that the run names.
         plant: the plant of the run, if the recipe's ``Config`` has no method ``plant()`` that makes it.
 
     Raises:
@@ -305,15 +305,13 @@ def _rebuilt(
 
 
 def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
-    """The configuration class of a recipe, given as the class, as its file, or as ``package.module:Config``.
+    """The configuration class of a recipe, given as the class or as its file.
 
     Raises:
-        ValueError: if there is no such file or module, or it defines no recipe; see :func:`load_recipe`.
+        ValueError: if there is no such file, or it defines no recipe; see :func:`load_recipe`.
     """
     if isinstance(recipe, type):
         return require_config(recipe, recipe.__qualname__)
-    if isinstance(recipe, str) and ":" in recipe and not Path(recipe).is_file():
-        return require_config(named(recipe), recipe)
     return load_recipe(Path(recipe)).Config
 
 

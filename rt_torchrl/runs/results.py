@@ -243,7 +243,7 @@ def reference_entry(
 
 
 MOST_WEIGHTS = 12
-"""Number of weights of the closure in the table."""
+"""Greatest number of weights of the closure that the table shows."""
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
@@ -313,7 +313,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(found["twin"])
-    lines += closure_lines(found["closure"], most=MOST_WEIGHTS, errors=found["twin"]["standard_errors"])
+    lines += closure_lines(found["closure"], found["twin"]["standard_errors"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
 
@@ -383,38 +383,26 @@ def fit_lines(twin: dict[str, Any]) -> list[str]:
     return [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
 
 
-def closure_lines(
-    closure: dict[str, Any], most: int = 1000, errors: dict[str, float | None] | None = None
-) -> list[str]:
+def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | None = None) -> list[str]:
     """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
 
-    The true weights of the same names and the standard errors are shown, if there are any. Of more weights than
-    ``most``, those are shown that have changed most.
+    The true weights of the same names and the standard errors are shown, if there are any.
     """
-    if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
+    found = closure["found"]
+    if not found or not all(isinstance(value, float | None) for value in found.values()):
         return []
-    true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
-    described = closure["described"]
-    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'std. error':>12}" if errors else "")]
-    lines[0] += f"{'true':>12}" if true else ""
-    chosen = list(closure["found"])
-    if len(chosen) > most:
-        change = {name: _change(closure["start"].get(name), closure["found"][name]) for name in chosen}
-        moved = sorted(chosen, key=change.__getitem__)[-most + 1 :]
-        chosen = [name for name in chosen if name in moved]
-    for name in chosen:
-        value = closure["found"][name]
-        weights = [closure["start"].get(name), value]
-        if errors:
-            weights.append(errors.get(name))
-        if true:
-            weights.append(true.get(name))
-        about = described.get(name, {"unit": "", "meaning": ""})
+    if len(found) > MOST_WEIGHTS:
+        return [f"  closure: {len(found)} weights, in metrics.json"]
+    true = {name: value for name, value in (closure.get("true") or {}).items() if name in found}
+    columns = {"start": closure["start"], "found": found}
+    columns |= {"std. error": errors} if errors else {}
+    columns |= {"true": true} if true else {}
+    lines = [f"  {'closure weight':<22}" + "".join(f"{column:>12}" for column in columns)]
+    for name in found:
+        about = closure["described"].get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{about['unit']}]" if about["unit"] else name
-        shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
+        shown = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
         lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
-    if len(chosen) < len(closure["found"]):
-        lines.append(f"  {len(closure['found']) - len(chosen)} more, which have changed less, are in metrics.json")
     return lines
 
 
@@ -446,13 +434,6 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     return [f"  {about}", *last]
 
 
-def _change(start: float | None, found: float | None) -> float:
-    """Relative change of a weight; that of one that is not a finite number comes first."""
-    if start is None or found is None:
-        return float("inf")
-    return abs(found - start) / max(abs(start), abs(found), 1e-300)
-
-
 def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
@@ -480,28 +461,14 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
+    elif not alone:
+        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
+    elif live == "model_based" and config is not None and config.twinning.planner.method == "receding_horizon":
+        steps.append(f"take the twin away, on which it plans: {call_of('export')} {folder} --what twin")
     else:
-        planner = None if config is None else config.twinning.planner.method
-        steps += _taking_away(live, folder, planner, found["believed"], alone=alone)
+        steps.append(f"take the controller away: {call_of('export')} {folder} --role {live}")
     if twin:
         steps.append(
             "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
         )
     return "\n".join(f"  next: {step}" for step in steps)
-
-
-def _taking_away(live: str, folder: Path, planner: str | None, believed: str | None, *, alone: bool) -> list[str]:
-    """What to do with the live policy; model predictive control acts from here, and its model can be exported.
-
-    Model predictive control plans on the twin alone, also where a hypothesis explains the records better.
-    """
-    planned = live == "model_based" and planner == "receding_horizon"
-    if not alone:
-        model = "take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"
-        law = f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"
-        return [model if planned else law]
-    if planned:
-        model = "model that it plans on" if believed is None else f"twin with {believed}, on which it does not plan,"
-        return [f"take the {model} away: {call_of('export')} {folder} --what twin"]
-    role = "" if live == "model_based" else " --role model_free"
-    return [f"take the controller away: {call_of('export')} {folder}{role}"]

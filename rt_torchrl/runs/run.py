@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
 
 
-FIGURES_EVERY = 5
-"""Number of episodes after which the figures are drawn into the dashboard again."""
 PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
 
 
@@ -262,8 +260,8 @@ class Run:
                 flown = first_flights(self.unseen, self.algorithm.referee.live, flights)
                 where = "on the twin" if self.unseen.judged_on == "twin" else ""
                 unseen = {"unseen": figures.unseen(judged, self.unseen.categories(), where=where)}
-                snapshot, folder = self._snapshot(), self.folder / "figures"
-                images = self._pixels(snapshot, flown | unseen)
+                folder = self.folder / "figures"
+                images = self._pixels(flown | unseen)
                 folder.mkdir(exist_ok=True)
                 for name, image in images.items():
                     figures.save_pixels(image, folder / f"{name}.png")
@@ -317,10 +315,6 @@ class Run:
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record)
-        due = self.config.figures and len(self.episodes) % FIGURES_EVERY == 0
-        if due and len(self.episodes) < self.config.episodes:
-            safe_point()
-            dashboard.images(self._pixels(self._snapshot(), {}), len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""
@@ -388,10 +382,9 @@ class Run:
             J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
         return real_side.entries(real, J_p)
 
-    def _pixels(self, snapshot: Snapshot, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
+    def _pixels(self, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
         """Pixels of the figures of the training and of others, by name; each is drawn once."""
+        snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
         drawn = {**figures.figures_of(snapshot), **self.plant_figures(snapshot), **others}
         return {name: figures.pixels(figure) for name, figure in drawn.items()}
 
-    def _snapshot(self) -> Snapshot:
-        return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)

@@ -90,8 +90,8 @@ class RunConfig:
             anything is learned, and wiring that does not fit is refused; see :func:`check_real_system`.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
             unseen episodes.
-        figures: whether to draw figures, every five episodes into the dashboard and at the end into figures/; without
-            them a training among many ends sooner.
+        figures: whether to draw figures at the end, into figures/ and the dashboard; without them a training among many
+            ends sooner.
         unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
             is judged only at the end.
         noise: standard deviation of the real system's sensors, as a share of the value that they read.

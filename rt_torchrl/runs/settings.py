@@ -26,7 +26,7 @@ BESIDE = ("plant", "recipe", RAN)
 OWN_CLASS: dict[str, str | None] = {"class": "RunConfig", "file": None}
 """What a run with the configuration of this library itself names in the place of a recipe."""
 OF_EVERY_RUN = frozenset(option.name for option in dataclasses.fields(RunConfig))
-GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
+GIVE = "give the recipe: its file, or in code the class itself"
 
 
 def settings_of(config: RunConfig, plant: str) -> dict[str, Any]:
@@ -80,16 +80,11 @@ def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
     if origin == OWN_CLASS:
         return RunConfig
     try:
-        name, file = origin["class"], origin["file"]
-    except (TypeError, KeyError):
-        name = file = 0
-    if not isinstance(name, str) or not isinstance(file, str | None):
-        raise ValueError(f"{place} does not say which recipe made the run; {GIVE}.")
-    if "<locals>" in name or not file:
-        raise ValueError(f"the class {name} that made the run in {folder} was defined on the way; {GIVE}.")
-    path = Path(file)
+        name, path = str(origin["class"]), Path(origin["file"])
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"{place} does not say in which file the class is that made the run; {GIVE}.") from error
     if not path.is_absolute() or path.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"recipe {file} in {place} is not run: it came with the folder. To trust it, {GIVE}.")
+        raise ValueError(f"recipe {path} in {place} is not run: it came with the folder. To trust it, {GIVE}.")
     try:
         return require_config(attribute(module_of(path), name), name)
     except (ValueError, ImportError) as error:
