@@ -254,7 +254,6 @@ def test_the_summary_shows_the_weights_of_a_small_closure(stopped, count, rows):
     assert ("closure: 40 weights, in metrics.json" in shown) == (rows == 0)
 
 
-
 def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     metrics = stopped[1]
     live = metrics["summary"]["live"]
@@ -273,8 +272,6 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     assert said("model_free", math.inf, live="model_free").endswith("--role model_free")
     planned = said("model_based", math.inf, "receding_horizon", live="model_based")
     assert planned.endswith("--what twin")
-    beside = said("model_based", math.inf, "receding_horizon", live="model_based", believed="lags")
-    assert "the model that it plans on" in planned and "the twin with lags, on which it does not plan," in beside
 
 
 def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():

@@ -6,6 +6,7 @@ Development*, NREL/TP-500-38060, 2009, where no other source is named.
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -443,8 +444,8 @@ class EngineeringCost:
     r"""What the operator of a turbine pays for: energy that is not made, overspeed, and wear of the actuators.
 
     .. math::
-        L_a = w_P\Big(1 - \frac{\min(P, P_r)}{P_r}\Big) + w_X\Big(\frac{(P - P_r)_+}{P_r}\Big)^2
-        + w_\omega\Big(\frac{(\omega_g - \omega_{rated})_+}{\gamma_1}\Big)^2
+        L_a = 1 - \frac{\min(P, P_r)}{P_r} + \Big(\frac{(P - P_r)_+}{P_r}\Big)^2
+        + \Big(\frac{(\omega_g - \omega_{rated})_+}{\gamma_1}\Big)^2
         + w_O\Big(\frac{(\omega_g - \omega_{max})_+}{\gamma_1}\Big)^2
         + w_U\,\sigma\Big(\frac{u - u_{rated}}{0.5\,\mathrm{m/s}}\Big)
             \Big(\frac{(\omega_{rated} - \omega_g)_+}{\gamma_1}\Big)^2
@@ -456,10 +457,6 @@ class EngineeringCost:
     rotor give its energy where the wind falls short.
 
     Args:
-        energy: weight w_P of the share of rated power that is not made.
-        excess: weight w_X of power above rated.
-        overspeed: weight w_ω of speed above rated.
-        overshoot: weight w_O of speed above 110 % of rated, a soft constraint.
         underspeed: weight w_U of speed below rated in wind above rated.
         pitch_rate: weight w_β of the blades' rate.
         torque_rate: weight w_τ of the torque's rate.
@@ -468,13 +465,11 @@ class EngineeringCost:
         ValueError: if a weight is negative.
     """
 
-    energy: NotNegative = 1.0
-    excess: NotNegative = 1.0
-    overspeed: NotNegative = 1.0
-    overshoot: NotNegative = 10.0
     underspeed: NotNegative = 0.0
     pitch_rate: NotNegative = 0.01
     torque_rate: NotNegative = 0.01
+    overshoot: ClassVar[float] = 10.0
+    """Weight w_O of speed above 110 % of rated, a soft constraint."""
 
     def __call__(self, plant: WindTurbine, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         share = plant.generator_power(state, applied) / (plant.actions[0].high * plant.rated_generator_speed)
@@ -483,9 +478,9 @@ class EngineeringCost:
         windy = torch.sigmoid((exogenous[..., 0] - plant.rated_wind_speed) / 0.5)
         torque_rate, pitch_rate = ((applied - state[..., 4:6]) / plant.dt).unbind(-1)
         return (
-            self.energy * (1.0 - share.clamp(max=1.0))
-            + self.excess * (share - 1.0).clamp(min=0.0) ** 2
-            + self.overspeed * above.clamp(min=0.0) ** 2
+            (1.0 - share.clamp(max=1.0))
+            + (share - 1.0).clamp(min=0.0) ** 2
+            + above.clamp(min=0.0) ** 2
             + self.overshoot * beyond.clamp(min=0.0) ** 2
             + self.underspeed * windy * above.clamp(max=0.0) ** 2
             + self.pitch_rate * pitch_rate**2
