@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from printed_commands import ROOT, TEXTS, commands, options, spans
+from printed_commands import ROOT, TEXTS, commands, options
 
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.run_config import RunConfig
@@ -33,12 +33,6 @@ def whole(name, arguments):
 
 NO_OPTIONS = ROOT / "tests" / "no_options.json"
 """A file of options that gives none, in the place of one that a run leaves."""
-
-
-@pytest.fixture(autouse=True)
-def _with_every_logger(monkeypatch):
-    """As if the packages that the documentation tells to install were there."""
-    monkeypatch.setattr("rt_torchrl.runs.run_config.PACKAGES", ())
 
 
 def refusal(name, arguments):
@@ -100,13 +94,6 @@ def test_an_option_that_does_not_exist_is_found():
     assert refusal("wind_turbine", ["--policy", "cubic"]) and refusal(
         "identify", whole("identify", ["--initial", "guessed"])
     )
-
-
-def test_every_choice_of_a_policy_is_taken():
-    """The page of the options lists them behind the first one: bias, scheduled or mlp."""
-    assert {"bias", "scheduled", "mlp"} <= set(spans("options.md"))
-    for name in ("bias", "scheduled", "mlp"):
-        assert refusal("wind_turbine", ["--policy", name]) is None
 
 
 def test_checks_that_are_printed_are_what_ci_runs():
@@ -187,10 +174,3 @@ def direct(requirement, extras):
 
 def direct_of(extra, extras):
     return [text for requirement in extras[extra] for text in direct(requirement, extras)]
-
-
-def test_one_word_for_the_folder_of_the_results():
-    """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "export", "paper", "record_log"}
-    for name in set(RECIPES) - without:
-        assert "--log-dir" in help_of(name), name

@@ -143,10 +143,6 @@ def test_a_quick_training_of_the_pendulum_compiles_and_is_quiet(clone):
     assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)  # by Gymnasium's single precision
 
 
-def test_help_is_printed(clone):
-    assert "--twinning.arm" in done("uv run recipes/wind_turbine.py --help-all", clone).stdout
-
-
 def test_a_log_is_recorded_and_identified(clone):
     record, identify = (next(c for c in commands() if name in c) for name in ("record_log", "identify"))
     assert "log.csv" in record and '"rpm=rotor_speed[rpm]"' in identify
@@ -173,17 +169,6 @@ def test_a_policy_is_exported(formats, kinds, clone):
     done(f"{LAST}{folder}", clone)
     done(command, clone)
     assert kinds <= {path.suffix for path in (clone / folder / "exported").iterdir()}
-
-
-def test_the_dashboard_opens(clone, tmp_path):
-    require_begun("uv run tensorboard --logdir runs", clone, tmp_path, r"http://\S+")
-
-
-def test_the_hooks_are_installed(clone):
-    pytest.importorskip("pre_commit")
-    subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
-    done("uv run --group lint pre-commit install", clone)
-    assert (clone / ".git" / "hooks" / "pre-commit").exists()
 
 
 @pytest.mark.parametrize("command", [command for command in commands() if "recipes/study.py" in command])

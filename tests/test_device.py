@@ -14,8 +14,6 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from rt_torchrl.contract.check import check_plant
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_folder import load_tensors, save_tensors
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
@@ -255,16 +253,6 @@ def test_the_device_refuses_what_a_gpu_refuses():
         # What a GPU takes: numbers, numbers in tensors, places and copies.
         assert (here * torch.tensor(2.0)).sum().item() == 6.0
         assert here[torch.tensor([0])].device == here.copy_(torch.ones(3)).device == device
-
-
-@pytest.mark.slow
-def test_a_plant_elsewhere_is_checked_and_asked_there():
-    with pretend_device() as device:
-        plant = WindTurbine(horizon=5.0)
-        expected = plant.time_constant(11.0)
-        plant.to(device)
-        check_plant(plant, steps=2, traced=False)
-        assert plant.time_constant(11.0) == expected
 
 
 def test_files_are_read_without_the_device(tmp_path):

@@ -1,9 +1,7 @@
 """The interface of Bladed: our library against the policy in torch, ROSCO's controller on our turbine, and faults."""
 
-import copy
 import ctypes
 import math
-import pickle
 import subprocess
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.export import c_file
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.trajectories.state_feedback import Remembering
@@ -86,14 +83,6 @@ def test_a_library_commands_what_the_policy_commands(scheduled):
     assert 0.0 < ((flown.actions - exact).abs() / exact.new_tensor([43_093.55, 30.0])).max() < 1e-6
 
 
-def test_each_episode_has_a_library_of_its_own(scheduled):
-    plant, _, file, flown = scheduled
-    controller, n = DISCON(plant, file), 100
-    for k in (0, 1, 0):
-        alone = controller.fly(flown.states[k : k + 1, 0], flown.exogenous[k : k + 1, :n])
-        assert torch.equal(alone.states[0], flown.states[k, : n + 1])
-
-
 def by_roscos_interface(kind, file, input_file, plant, flown, folder):
     """The demands of a library in an episode, called by ROSCO's interface: torque [N m] and pitch [deg]."""
     interface = kind(str(file), param_filename=str(input_file), DT=plant.dt, sim_name=str(folder / "rosco"))
@@ -118,14 +107,6 @@ class Recorded(DISCON):
         command, memory = super().law(state, memory, exogenous)
         self.demands.append(command[0].tolist())
         return command, memory
-
-
-def test_roscos_control_interface_gets_the_same(scheduled, tmp_path, capfd):
-    kind = pytest.importorskip("rosco.toolbox.control_interface").ControllerInterface
-    plant, _, file, flown = scheduled
-    controller = Recorded(plant, file)
-    controller.fly(flown.states[:1, 0], flown.exogenous[:1])
-    assert list(by_roscos_interface(kind, file, "none", plant, flown, tmp_path)) == controller.demands
 
 
 # The library by itself, called without this library's class.
@@ -235,39 +216,6 @@ def test_a_library_is_told_the_state_of_the_turbine(tmp_path):
     assert plant.generator_efficiency * 43_093.55 * 122.9096 == pytest.approx(5e6)
 
 
-class Stalling(WindTurbine):
-    """A turbine whose episode ends where the rotor is slower than 0.9 rad/s."""
-
-    end_cost = 1.0
-
-    def ended(self, state):
-        return state[..., 0] < 0.9
-
-
-@needs_compiler
-def test_an_episode_that_has_ended_stays_in_its_state(tmp_path):
-    """The full torque stops the rotor in one wind, and not in the other."""
-    plant = Stalling(horizon=30.0)
-    start, wind = drawn(plant, 2)
-    start[:, 0], wind[0], wind[1] = 1.2, 5.0, 20.0
-    flown = DISCON(plant, compiled(tmp_path, "{ s[46] = 43093.55f; s[44] = 0.0f; }", "full")).fly(start, wind)
-    ended = plant.ended(flown.states)
-    first = int(ended[0].int().argmax())
-    assert 0 < first < 50 and not ended[1].any()
-    assert (flown.states[0, first:] == flown.states[0, first]).all()
-    assert ((flown.states[1, 1:, 0] - flown.states[1, :-1, 0]) != 0.0).all()
-
-
-def test_a_copy_and_one_of_another_process_fly_the_same(scheduled):
-    """As the acting process of an asynchronous training does; a copy of a controller in flight begins anew."""
-    plant, _, file, flown = scheduled
-    controller, (start, wind) = DISCON(plant, file), (flown.states[:1, 0], flown.exogenous[:1, :20])
-    for _ in range(2):
-        for made in (copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
-            assert torch.equal(made.fly(start, wind).states, flown.states[:1, :21])
-        controller.act(0.0, start, wind[:, 0])
-
-
 @needs_compiler
 def test_a_library_may_fail_or_warn(tmp_path):
     plant = WindTurbine(horizon=5.0)
@@ -284,12 +232,6 @@ def test_a_library_may_fail_or_warn(tmp_path):
     warns = DISCON(plant, compiled(tmp_path, '{ *fail = 1; strcpy(message, "little oil"); }', "warns"))
     with pytest.warns(UserWarning, match=r"warns\.so: little oil"):
         assert warns.fly(start, wind).actions.shape == (1, 10, 2)
-
-
-def test_a_wrong_time_step_is_refused_in_the_words_of_the_library(scheduled):
-    plant = WindTurbine(dt=0.25, horizon=5.0)
-    with pytest.raises(ValueError, match="communication interval is 0.25 s and must be 0.5 s"):
-        DISCON(plant, scheduled[2]).fly(*drawn(plant, 1))
 
 
 @needs_compiler
@@ -376,14 +318,6 @@ def test_a_policy_that_needs_more_than_the_swap_array_is_refused(tmp_path):
     with pytest.raises(ValueError, match="must end in .c"):
         export_discon(LinearGain([[1.0]]), tmp_path / "discon.so", preview)
     assert not list(tmp_path.iterdir())
-
-
-def test_without_a_compiler_only_the_source_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(c_file, "COMPILERS", ("no-such-compiler",))
-    plant = WindTurbine()
-    with pytest.warns(UserWarning, match="no C compiler"):
-        assert export_discon(most(plant), tmp_path / "discon.c", plant) is None
-    assert [path.name for path in tmp_path.iterdir()] == ["discon.c"]
 
 
 @needs_compiler

@@ -1,7 +1,6 @@
 """Programs of torch.export and ONNX models: against the policy, and without this library."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ from test_run_folder import Full
 from torch import nn
 
 from rt_torchrl import export_c, shipped_plants
-from rt_torchrl.export import c_file, program
 from rt_torchrl.export.program import export_onnx, export_program
 from rt_torchrl.plants.policies import SaturatedMLP
 
@@ -86,12 +84,6 @@ def by_onnxruntime(path):
     return lambda e: torch.from_numpy(session.run(["action"], {"observation": e.numpy()})[0]), json.loads(described)
 
 
-def test_onnx_without_its_packages_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr(program, "ONNX_PACKAGES", ("onnx_of_no_one",))
-    with pytest.raises(ValueError, match=r"package onnx_of_no_one.*pip install 'rt_torchrl\[export\]'"):
-        export_onnx(LinearGain([[0.1, 0.2]]), tmp_path / "policy.onnx", LinearQuadratic())
-
-
 @pytest.mark.parametrize(("export", "name"), [(export_onnx, "policy.onnx"), (export_program, "policy.pt2")])
 def test_an_export_onto_a_full_disk_leaves_the_old_file(export, name, tmp_path, monkeypatch):
     if export is export_onnx:
@@ -109,27 +101,6 @@ def test_an_export_onto_a_full_disk_leaves_the_old_file(export, name, tmp_path, 
         with pytest.raises(OSError, match="No space left on device"):
             export(LinearGain([[0.1, 0.2]]), tmp_path / name, LinearQuadratic())
     assert (tmp_path / name).read_text() == "old" and [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_what_onnxruntime_cannot_run_is_refused(tmp_path, monkeypatch):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-
-    def lacking(*args, **kwargs):  # as onnxruntime 1.31 of the double-precision Elu
-        raise NotImplementedError("Could not find an implementation for Elu(6)")
-
-    monkeypatch.setattr(onnxruntime, "InferenceSession", lacking)
-    with pytest.raises(
-        ValueError, match=r"onnxruntime cannot run policy LinearGain .*Elu\(6\)\. Use the \.pt2 program or C"
-    ):
-        export_onnx(LinearGain([[0.1, 0.2]]), tmp_path / "policy.onnx", LinearQuadratic())
-    assert not list(tmp_path.iterdir())
-
-
-def test_exporting_leaves_the_policy_as_it_was(tmp_path):
-    policy = SaturatedMLP(2, LinearQuadratic.actions, generator=seeded()).train()
-    export_program(policy, tmp_path / "policy.pt2", LinearQuadratic())
-    assert policy.training and all(weight.requires_grad for weight in policy.parameters())
 
 
 class Law(nn.Module):
@@ -171,13 +142,4 @@ def test_what_is_no_function_of_the_observation_is_refused(name, tmp_path):
     formula, message = REFUSED[name]
     with pytest.raises(ValueError, match=f"(?s){message}"):
         export_program(Law(formula), tmp_path / "policy.pt2", LinearQuadratic())
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["the batch as a whole", "a fixed batch"])
-def test_a_c_function_of_one_observation_is_compared_with_the_policy_of_many(name, tmp_path):
-    if not any(map(shutil.which, c_file.COMPILERS)):
-        pytest.skip("no C compiler here")
-    with pytest.raises(ValueError, match="the C function of policy Law differs from the original by .*'force'"):
-        export_c(Law(REFUSED[name][0]), tmp_path / "policy.c", LinearQuadratic())
     assert not list(tmp_path.iterdir())

@@ -15,7 +15,7 @@ from rt_torchrl import export_c, shipped_plants
 from rt_torchrl.export import c_file
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.programs.c_source import CSource, literal
 from rt_torchrl.programs.rules import new_tracer
 
@@ -37,24 +37,6 @@ def called(function, observation, n_actions):
     action = c_array([0.0] * n_actions)
     function(c_array(observation), action)
     return torch.tensor(action, dtype=torch.float64)
-
-
-@needs_compiler
-@pytest.mark.parametrize("name", ["cryogenic_tank", "pendulum", "wind_turbine", "flapping_wing"])
-def test_policies_of_the_plants(name, tmp_path):
-    plant = shipped_plants()[name]()
-    policy = plant.make_policy(seeded())
-    if name == "flapping_wing":
-        policy = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=seeded())
-    with torch.no_grad():
-        for weight in policy.parameters():  # biases too, as a training leaves them
-            weight.add_(0.5 * torch.randn(weight.shape, generator=seeded(), dtype=torch.float64))
-    assert export_c(policy, tmp_path / "policy.c", plant, function="act") < ROUNDING
-    function = library(tmp_path / "policy.c").act
-    low, high = bounds(plant.actions)
-    for observation in 2.0 * torch.randn(50, len(plant.observations), generator=seeded(), dtype=torch.float64):
-        error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / (high - low)
-        assert error.max() < ROUNDING
 
 
 @needs_compiler
@@ -227,31 +209,11 @@ def test_what_has_no_c_form_is_refused(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-class Sorted(nn.Module):
-    def forward(self, e):
-        return e.sort(-1).values
-
-
-def test_a_refusal_names_the_layer(tmp_path):
-    policy = nn.Sequential(nn.Sequential(nn.Linear(2, 1, dtype=torch.float64), Sorted()), nn.Tanh())
-    with pytest.raises(ValueError, match=r"layer '0\.1' \(Sorted\) of policy Sequential cannot be written in C"):
-        export_c(policy, tmp_path / "policy.c", LinearQuadratic())
-
-
 def test_a_machine_without_compiler_says_that_nothing_was_checked(tmp_path, monkeypatch):
     monkeypatch.setattr(c_file, "COMPILERS", ("no_such_compiler",))
     with pytest.warns(UserWarning, match="not checked: there is no C compiler"):
         assert export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic()) is None
     assert (tmp_path / "policy.c").exists() and (tmp_path / "policy.h").exists()
-
-
-@needs_compiler
-def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
-    right = CSource.text
-    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.25", "0.2500004"))
-    with pytest.raises(ValueError, match=r"the C function of policy LinearGain differs from the original by .*'force'"):
-        export_c(LinearGain([[0.25, 1.0]]), tmp_path / "policy.c", LinearQuadratic())
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,12 @@ import re
 
 import pytest
 import torch
-from c_build import library, needs_compiler, printed
+from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from seeds_and_numbers import seeded
 
-from rt_torchrl import check_plant, export_controller, export_twin, shipped_plants
-from rt_torchrl.contract.check import PlantContractError
+from rt_torchrl import export_controller, export_twin, shipped_plants
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.c_file import c_array
@@ -195,29 +194,6 @@ def test_the_error_of_the_filters_is_of_second_order(tmp_path):
 
 
 @needs_compiler
-def test_linear_dynamics_against_the_matrix_exponential(tmp_path):
-    """A controller without states is the policy; the loop that it closes is that of the closed form."""
-    plant = LinearQuadratic(dt=0.01, horizon=2.0, noise=0.0)
-    export_controller(LinearGain([[0.3, 0.2]]), tmp_path / "gain.c", plant, name="gain")
-    in_c = InC(tmp_path / "gain.c", 1, 0, 2)
-    start = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
-    in_c.start(*start[0].tolist())
-    states, _ = flown(
-        plant,
-        start,
-        torch.zeros(1, 200, 1, dtype=torch.float64),
-        lambda k, state: torch.tensor([in_c.step(*state[0].tolist())], dtype=torch.float64),
-    )
-    A, B, C = (torch.tensor(x, dtype=torch.float64) for x in (plant.A, plant.B, plant.true_closure))
-    block = torch.zeros(3, 3, dtype=torch.float64)
-    block[:2, :2], block[:2, 2:] = A + C, B
-    held = torch.from_numpy(expm(0.01 * block.numpy()))
-    step = held[:2, :2] - held[:2, 2:] @ torch.tensor([[0.3, 0.2]], dtype=torch.float64)
-    # 200 steps of the fourth order.
-    torch.testing.assert_close(states[-1], torch.linalg.matrix_power(step, 200) @ start[0], rtol=0.0, atol=1e-9)
-
-
-@needs_compiler
 @pytest.mark.parametrize("name", [*shipped_plants(), "gain-scheduled"])
 def test_controllers_of_the_plants(name, tmp_path, monkeypatch):
     monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 100)
@@ -228,35 +204,6 @@ def test_controllers_of_the_plants(name, tmp_path, monkeypatch):
     for signal in plant.actions:
         assert re.search(rf"action\[\d\] +{signal.name} +\[{re.escape(signal.unit)}\]", header)
     InC(tmp_path / "it.c", len(plant.actions), len(plant.controller_states), 9)  # without a warning
-
-
-@needs_compiler
-def test_only_signals_that_matter_are_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
-    tank = shipped_plants()["cryogenic_tank"]()
-    export_controller(tank.make_policy(seeded()), tmp_path / "tank.c", tank, name="tank")
-    lines = (tmp_path / "tank.h").read_text().splitlines()
-    assert [line.split()[1:3] for line in lines if line.startswith(" * measured[")] == [["measured[0]", "pressure"]]
-
-
-@needs_compiler
-def test_a_program_in_c_that_includes_the_header(tmp_path, monkeypatch):
-    """The calls of the header's comment, in a program that a user would write."""
-    monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
-    export_controller(law(WindTurbine()), tmp_path / "turbine.c", WindTurbine(), name="turbine")
-    comment = (tmp_path / "turbine.h").read_text().partition("*/")[0].splitlines()
-    calls = [line.removeprefix(" *").strip() for line in comment if line.endswith(";")]
-    declared, arrays, init, step = calls
-    read = "measured[0] = 1.2; measured[1] = 11.0;"
-    (tmp_path / "main.c").write_text(
-        f'#include "turbine.h"\n#include <stdio.h>\nint main(void) {{ {declared} {arrays} {read} {init}\n'
-        f'    for (int k = 0; k < 3; ++k) {{ {step} }} printf("%.17g %.17g", action[0], action[1]); return 0; }}\n'
-    )
-    in_a_program = printed(tmp_path, "main.c", "turbine.c")
-    in_c = InC(tmp_path / "turbine.c", 2, 5, 2)
-    in_c.start(1.2, 11.0)
-    found = [in_c.step(1.2, 11.0) for _ in range(3)]
-    assert [float(x) for x in in_a_program.split()] == found[-1]
 
 
 # What is no controller is refused; angles go the short way.
@@ -322,11 +269,6 @@ def test_what_is_no_controller_is_refused(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_check_of_a_plant_finds_a_misnamed_state():
-    with pytest.raises(PlantContractError, match="controller_states: 'speed_error' is no state"):
-        check_plant(Misnamed(dt=0.1), traced=False)
-
-
 @needs_compiler
 def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
     right = CSource.text
@@ -384,12 +326,3 @@ def test_a_linear_twin_against_the_matrix_exponential(tmp_path):
     found = build(tmp_path / "twin.c")(0.0, start[:2], start[2:3], start[3:])
     # One step of the fourth order.
     torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01**5)
-
-
-@needs_compiler
-def test_a_wrong_translation_of_a_twin_is_not_written(tmp_path, monkeypatch):
-    right = CSource.text
-    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.125", "0.1250004"))
-    with pytest.raises(ValueError, match="twin_step in C differs from the original by"):
-        export_twin(LinearClosure([[0.0, 0.0], [0.125, 0.0]]), tmp_path / "twin.c", LinearQuadratic(), name="twin")
-    assert not list(tmp_path.iterdir())

@@ -1,7 +1,6 @@
 """FMUs: their content, what a simulator gets of them, and trainings on one."""
 
 import ctypes
-import json
 import re
 import warnings
 from pathlib import Path
@@ -11,12 +10,9 @@ import pytest
 import torch
 from c_build import needs_compiler
 
-from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export import c_file
 from rt_torchrl.export.fmu import export_policy_fmu, export_twin_fmu
-from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.run import Run
 from rt_torchrl.systems.adapters import FMUEnvironment, FMUError
 from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.trajectories.rollout import Rollout
@@ -161,42 +157,6 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
     made.close()
 
 
-class Stubborn:
-    """An FMU that refuses every step, and to terminate after that."""
-
-    def __init__(self):
-        self.freed = False
-
-    def refuse(self, **given):
-        raise RuntimeError("fmi2Error")
-
-    doStep = terminate = refuse
-    setupExperiment = enterInitializationMode = exitInitializationMode = setReal = lambda self, *given, **times: None
-
-    def getReal(self, places):
-        return [0.0] * len(places)
-
-    def freeInstance(self):
-        self.freed = True
-
-
-@needs_compiler
-def test_an_fmu_that_refuses_to_terminate_is_freed_and_its_folder_removed(turbine, monkeypatch):
-    instances = []
-    monkeypatch.setattr(
-        fmpy.simulation, "instantiate_fmu", lambda *given: instances.append(Stubborn()) or instances[-1]
-    )
-    made = environment(turbine)
-    for _ in range(2):
-        entries = made.reset()
-        with pytest.raises(FMUError, match="refuses to doStep at t = 0 s: fmi2Error"):
-            made.step(entries.set("action", torch.tensor([1e4, 0.0]).double()))
-    folder = Path(made._folder)
-    assert instances[0].freed and folder.is_dir()
-    made.close()
-    assert instances[1].freed and not folder.exists()
-
-
 @needs_compiler
 def test_what_does_not_fit_an_fmu_is_refused(turbine, tmp_path):
     (tmp_path / "no.fmu").write_text("nothing")
@@ -226,84 +186,3 @@ def test_an_fmu_that_cannot_be_written_is_refused_before_the_work(tmp_path, monk
 
 
 # A whole training whose real system is an FMU, against one whose real system is the plant.
-
-
-OPTIONS = (
-    *("--horizon", "60", "--episodes", "2", "--unseen", "3", "--no-figures", "--threads", "1"),
-    *("--twinning.learner.critic-iterations", "30", "--twinning.learner.actor-iterations", "30"),
-    # L-BFGS makes per cents of the last digit in some tens of steps; these two methods do not.
-    *("--twinning.assimilation.method", "levenberg_marquardt", "--twinning.assimilation.iterations", "10"),
-    *("--twinning.planner.descent.optimiser", "adam", "--twinning.planner.iterations", "5"),
-    *("--start", "random", "--policy", "paper"),
-    # Nor does the choice among several twins, which are fitted by L-BFGS.
-    *("--twinning.hypotheses.which", "none"),
-)
-
-
-class PlantInPlace:
-    """The calls of an FMU, answered by the plant in torch; the references are those of the FMU."""
-
-    def __init__(self, plant):
-        self.plant, self.values = plant, [0.0] * (3 + len(plant.states))
-
-    def setReal(self, places, values):
-        for place, value in zip(places, values, strict=True):
-            self.values[place] = value
-
-    def getReal(self, places):
-        return [self.values[place] for place in places]
-
-    @torch.no_grad()
-    def doStep(self, currentCommunicationPoint, communicationStepSize):
-        tensors = [torch.tensor(part).double() for part in (self.values[3:], self.values[:2], self.values[2:3])]
-        t = torch.tensor(currentCommunicationPoint).double()
-        self.values[3:] = self.plant.step(t, *tensors, self.plant.closure).state.tolist()
-
-    def setupExperiment(self, **options):
-        pass
-
-    enterInitializationMode = exitInitializationMode = terminate = freeInstance = lambda self: None
-
-
-def trained(folder, path):
-    """The results of a short training with all six steps."""
-    from pathlib import Path
-
-    recipe = load_recipe(Path(__file__).parent.parent / "recipes" / "wind_turbine.py")
-    config = from_command_line(recipe.Config, [*OPTIONS, "--log-dir", str(folder)])
-    plant = config.plant()
-    names = [f"state.{s.name}" for s in plant.states]
-
-    def start(generator):
-        return dict(zip(names, plant.draw_initial_state(1, generator)[0].tolist(), strict=True))
-
-    given = {"actions": [f"command.{s.name}" for s in plant.actions], "outputs": names}
-    system = FMUEnvironment(path, plant, **given, exogenous=["exogenous.wind_speed"], start=start, seed=5)
-    real = RealSystem(
-        system, plant, state=Reading(keys=("outputs",)), exogenous=Reading(keys=("exogenous",)), closure=plant.closure
-    )
-    Run(config, plant, env=real, first=JonkmanController).train()
-    real.close()
-    return json.loads((folder / "metrics.json").read_text())
-
-
-@needs_compiler
-@pytest.mark.nightly
-def test_a_training_on_an_fmu_is_one_on_the_plant(tmp_path, monkeypatch):
-    """Rounding of the C code is all that parts them; every episode of learning lets it grow."""
-    plant = WindTurbine(horizon=60.0, observe=("measured+wind",))
-    export_twin_fmu(plant.closure, tmp_path / "turbine.fmu", plant)
-    assert environment(tmp_path / "turbine.fmu")
-    found = trained(tmp_path / "fmu", tmp_path / "turbine.fmu")
-    # The same, in which no machine code of the FMU runs.
-    monkeypatch.setattr(fmpy.simulation, "instantiate_fmu", lambda *given: PlantInPlace(plant))
-    expected = trained(tmp_path / "in place", tmp_path / "turbine.fmu")
-    pairs = zip(found["episodes"], expected["episodes"], strict=True)
-    for one, other in pairs:
-        assert one["real_cost"] == pytest.approx(other["real_cost"], rel=1e-6)
-        assert (one["live"], one["event"]) == (other["live"], other["event"])
-    for role in ("model_based", "model_free"):
-        costs = [one["summary"]["unseen"][f"J_a_{role}"]["mean"] for one in (found, expected)]
-        assert costs[0] == pytest.approx(costs[1], rel=1e-6)
-    # Of combinations of weights that hardly change J_p, rounding decides more.
-    assert found["summary"]["closure"]["found"] == pytest.approx(expected["summary"]["closure"]["found"], rel=1e-3)

@@ -62,20 +62,6 @@ def test_a_handler_of_somebody_else_stays(capfd):
     assert "interrupted" not in capfd.readouterr().err
 
 
-def test_a_thread_may_train():
-    seen = []
-
-    def work():
-        with Interruption():
-            safe_point()
-            seen.append(True)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert seen
-
-
 def deterministic(episodes):
     return [{**record, "seconds": None} for record in episodes]
 
@@ -115,15 +101,6 @@ def trained(tmp_path_factory):
 def test_an_interrupt_loses_nothing_but_the_episode_under_way(tmp_path, trained, share):
     whole, seconds = trained
     require_nothing_lost(tmp_path, whole, share * seconds)
-
-
-@pytest.mark.slow
-def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_path, trained):
-    whole, seconds = trained
-    moments = [1.0 - (1.0 - k / 20) ** 2 for k in range(20)]  # a training traces its learner in the first episode
-    done = {require_nothing_lost(tmp_path / str(share), whole, max(share * seconds, 1e-3)) for share in moments}
-    # The moments were of all kinds: before the first episode, between any two, and after the last.
-    assert len(done & set(range(1, EPISODES + 1))) >= 3
 
 
 def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from test_classical import PD
-from torch import nn
 
 from rt_torchrl import (
     Measurement,
@@ -19,7 +18,6 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.contract.check import require_controller
-from rt_torchrl.options import configuration
 from rt_torchrl.runs.run import Run
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
@@ -46,14 +44,6 @@ def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way()
     Turning.discrepancy_scales = (0.0,)
     with pytest.raises(ValueError, match=r"discrepancy_scales=\(0.0,\) of plant 'turning'"):
         Turning().discrepancy(one[:, :1], other[:, :1])
-
-
-def test_a_discrepancy_that_is_no_sum_of_squares_is_refused_with_what_to_give_instead():
-    with pytest.raises(ValueError, match=r"Own.discrepancy: .* give the scales .* discrepancy_scales, with math.inf"):
-
-        class Own(LinearQuadratic):
-            def discrepancy(self, state, measured):
-                return (state - measured).abs().sum(-1)
 
 
 class Clocked(LinearQuadratic):
@@ -144,17 +134,6 @@ def test_a_text_stands_for_a_path(unchecked):
         RunConfig(log_dir="")
 
 
-@configuration
-class AnyPolicy(RunConfig):
-    policy: str = "affine"
-
-
-def test_a_policy_that_nobody_makes_is_refused():
-    with pytest.raises(ValueError, match="policy='affine' does not exist; choose plant or mlp, or override"):
-        AnyPolicy().make_policy(PLANT, torch.Generator())
-    assert isinstance(AnyPolicy(policy="mlp").make_policy(PLANT, torch.Generator()), nn.Module)
-
-
 # Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.
 
 
@@ -191,20 +170,6 @@ def test_deviation_and_correlation_are_those_asked_for(intervals):
     for lag in (1, 2, 5):
         correlation = (found[lag:] * found[:-lag]).mean((0, 1)) / found.square().mean((0, 1))
         assert correlation.tolist() == pytest.approx([rho**lag] * len(plant.actions), abs=0.04)
-
-
-def test_an_episode_does_not_begin_with_the_noise_of_the_last_one():
-    plant = LinearQuadratic()
-    config = ExplorationConfig(correlation_time=1e6 * plant.dt, spread=0.1)
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    actor = LivePolicy(plant, policy, config, generator=torch.Generator().manual_seed(0))
-    observation = torch.zeros(len(plant.observations), dtype=torch.float64)
-    firsts = []
-    for _ in range(2):
-        actor.begin(policy, strength=1.0)
-        firsts.append(actor(observation))
-        torch.testing.assert_close(actor(observation), firsts[-1], rtol=0, atol=1e-2)
-    assert (firsts[0] - firsts[1]).abs().min() > 1e-2
 
 
 def test_the_strength_falls_to_zero():

@@ -18,10 +18,7 @@ from test_algorithm import STEPS, twinning
 from test_export_recipe import RECIPES
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.atomic_file import finite
-from rt_torchrl.envs.pendulum.plant import UniformRod
-from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
-from rt_torchrl.plants.closures import described_weights
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
@@ -32,7 +29,6 @@ from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 from rt_torchrl.steps.imitation import of_each_role
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
@@ -42,15 +38,6 @@ def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
     assert json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail) == metrics
     assert metrics["episodes"][0]["J_p"] is None and metrics["episodes"][0]["real_cost"] > 0.0
     assert "J_a model-based" in capsys.readouterr().out
-
-
-def test_infinite_costs_are_dashes_in_the_table(tmp_path):
-    metrics = small_run(tmp_path, episodes=1, figures=False).train()
-    unseen = metrics["summary"]["unseen"]
-    unseen["J_a_model_free"] = {"mean": float("inf"), "confidence_interval": [1.0, float("inf")]}
-    metrics["summary"]["J_a_ratio_model_free"] = float("inf")
-    row = next(line for line in results_table(finite(metrics)).splitlines() if "J_a model-free" in line)
-    assert row.split()[-4:] == ["-", "[1,", "-]", "-"]
 
 
 def judged(seed):
@@ -77,13 +64,6 @@ def test_the_better_policy_is_chosen_on_other_episodes_than_it_is_reported_on():
 
 def cheapest(policies, episodes):
     return min(policies, key=lambda role: stepped_cost(episodes, policies[role]))
-
-
-def test_on_a_real_system_the_better_policy_is_the_live_one():
-    plant, referee = LinearQuadratic(horizon=2.0), Mock(spec=["live"], live="model_free")
-    algorithm = Mock(spec=ReinforcementTwinning, referee=referee)
-    unseen = TwinEpisodes(DigitalTwin(plant, plant.closure), plant, 2)
-    assert results.better_of(algorithm, unseen) == "model_free"
 
 
 def test_clones_are_flown_once_and_other_policies_each():
@@ -122,12 +102,6 @@ def test_weights_are_shown_with_what_is_known_of_them(known, errors, columns, ro
     closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "described": {}} | known
     shown = [" ".join(line.split()) for line in closure_lines(closure, errors=errors)]
     assert shown == [f"closure weight start found{columns}", *rows]
-
-
-def test_units_and_meanings_are_those_that_the_closure_states():
-    described = described_weights(UniformRod.guess(0.5))
-    assert described["mass"] == {"unit": "kg", "meaning": "mass of the rod"} and list(described) == ["mass", "length"]
-    assert described_weights(torch.nn.Linear(1, 1)) == {}
 
 
 # The bar of a training says what is under way.
@@ -177,12 +151,6 @@ def stopped(tmp_path_factory):
 
     metrics = small_run(folder, 4, parts={"callbacks": [end_after_two]}).train()
     return folder, metrics, seen
-
-
-def test_a_callback_ends_the_training_and_its_results_are_written(stopped):
-    folder, metrics, seen = stopped
-    assert seen == [1, 2] and len(metrics["episodes"]) == 2
-    assert json.loads((folder / "metrics.json").read_text())["summary"]["cost_of_learning"]["episodes"] == 2
 
 
 def test_tensorboard_has_the_final_costs_and_the_table(stopped):

@@ -59,13 +59,6 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert len(each) == 3 and sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
 
 
-def test_a_run_without_figures_has_the_same_results(tmp_path):
-    whole = small_run(tmp_path / "whole", episodes=1, figures=True).train()
-    bare = small_run(tmp_path / "bare", episodes=1).train()
-    assert [(tmp_path / name / "figures").exists() for name in ("whole", "bare")] == [True, False]
-    assert_same(whole, bare)
-
-
 def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     run = small_run(tmp_path)
     found = run.train()["summary"]
@@ -104,16 +97,6 @@ def test_the_twin_follows_a_system_that_wears(tmp_path):
     torch.testing.assert_close(closures[0], torch.tensor(LinearQuadratic.true_closure), rtol=0, atol=1e-6)
     assert closures[1].abs().max() < 1e-6 and closures[2].abs().max() < 1e-6
     assert found["summary"]["closure"]["true"] == {"matrix": [[0.0, 0.0], [0.0, 0.0]]}
-
-
-def test_noise_of_the_sensors_reaches_the_record(tmp_path):
-    starts = []
-    for noise in (0.0, 0.01):
-        run = small_run(tmp_path / str(noise), episodes=1, noise=noise)
-        run.train()
-        starts.append(run.algorithm.short_term[-1].states[0])
-    ratio = starts[1] / starts[0]
-    assert (ratio != 1.0).all() and (ratio - 1.0).abs().max() < 0.05
 
 
 def test_a_twin_may_believe_in_another_plant(tmp_path):
@@ -218,16 +201,6 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         small_run(tmp_path / "file" / "run")
 
 
-def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
-
-    class Other(LinearQuadratic):
-        name = "other"
-
-    with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
-        small_run(tmp_path, 1, Other(horizon=2.0), resume=True)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -253,10 +226,6 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
 def test_bad_options_are_refused(options, message, unchecked):
     with pytest.raises(ValueError, match=message):
         RunConfig(**options)
-
-
-def test_the_greatest_seed_is_a_seed(tmp_path):
-    small_run(tmp_path, seed=RunConfig(seed=2**63 - 2).seed)
 
 
 def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):

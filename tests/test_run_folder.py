@@ -7,36 +7,22 @@ import json
 import os
 import pickle
 import stat
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from torch import nn
 
-from rt_torchrl.atomic_file import write_atomically, write_json, write_results
+from rt_torchrl.atomic_file import write_json, write_results
 from rt_torchrl.options import read_options
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.run_folder import RunFolder, load_tensors, plain, save_tensors
+from rt_torchrl.runs.run_folder import RunFolder, load_tensors, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings
 from rt_torchrl.steps.plan import MakePlan
 from rt_torchrl.systems.config import OperationConfig
-
-HOLDER = """
-import sys
-import filelock
-lock = filelock.FileLock(sys.argv[1])
-lock.acquire()
-print("held", flush=True)
-sys.stdin.read()
-"""
 
 
 def begun(path, **options):
@@ -57,27 +43,6 @@ def test_a_folder_in_use_is_refused_until_it_is_let_go(tmp_path):
     with pytest.raises(ValueError, match="log_dir=.* is in use by another training"):
         RunFolder(RunConfig(log_dir=tmp_path), "p")
     folder.release()
-    RunFolder(RunConfig(log_dir=tmp_path), "p").release()
-
-
-def test_runs_begun_within_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(time, "strftime", lambda *_: "20260101-000000")
-    folders = [RunFolder(RunConfig(seed=3), "p") for _ in range(3)]
-    assert [str(folder.path.relative_to("runs/p")) for folder in folders] == [
-        "20260101-000000-seed-3",
-        "20260101-000000-2-seed-3",
-        "20260101-000000-3-seed-3",
-    ]
-
-
-def test_a_killed_process_lets_its_folder_go(tmp_path):
-    holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path / ".lock")], stdin=-1, stdout=-1, text=True)
-    assert holder.stdout.readline() == "held\n"
-    with pytest.raises(ValueError, match="is in use by another training"):
-        RunFolder(RunConfig(log_dir=tmp_path), "p")
-    holder.kill()
-    holder.wait()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
 
 
@@ -226,20 +191,6 @@ def test_a_changed_bit_is_noticed_or_without_effect(tmp_path):
     assert noticed > 500
 
 
-def test_a_foreign_or_torn_file_is_refused_by_name(tmp_path):
-    file = tmp_path / "checkpoint.pt"
-    save_tensors(file, CONTENT)
-    whole = file.read_bytes()
-    torn = [whole[:length] for length in (*range(0, len(whole), 37), len(whole) - 1)]
-    for content in (b"\x00" * 100, b"PK\x03\x04", b"{}", os.urandom(5000), *torn):
-        file.write_bytes(content)
-        with pytest.raises(ValueError, match="checkpoint.pt is damaged, or no file of a run"):
-            load_tensors(file)
-    save_tensors(file, [1, 2])
-    with pytest.raises(ValueError, match="checkpoint.pt is no file of a run: it holds a list"):
-        load_tensors(file)
-
-
 class Full:
     """A file on a full disk, which takes only a part of the content."""
 
@@ -303,21 +254,6 @@ def test_a_write_that_fails_says_what_is_there_now(old, patch, said, left, tmp_p
     assert (file.read_text() if file.exists() else None) == left
 
 
-def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
-    """The process is killed at the end of the writing, when only the new name is not on the disk yet."""
-    file = tmp_path / "metrics.json"
-    write_json(file, {"old": 1})
-
-    def killed(self, target):
-        assert json.loads(file.read_text()) == {"old": 1}
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "replace", killed)
-    with pytest.raises(KeyboardInterrupt):
-        write_atomically(file, b"{")
-    assert json.loads(file.read_text()) == {"old": 1} and len(list(tmp_path.iterdir())) == 1
-
-
 def test_numbers_that_json_does_not_have_are_null(tmp_path):
     """Paths are text then, and dataclasses objects."""
     file, found = tmp_path / "metrics.json", {"a": (float("inf"), 1.0), "b": {"c": float("nan"), "d": "NaN"}}
@@ -342,14 +278,6 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
     small_run(path, episodes=2, **QUICK).train()
     return path
-
-
-def test_a_checkpoint_holds_tensors_in_plain_containers(folder):
-    found = torch.load(folder / "checkpoint.pt", weights_only=True)
-    assert plain(found).keys() == {"format", "episodes", "state"} and len(found["episodes"]) == 2
-    assert (
-        found["state"]["algorithm"]["module.learn._extra_state"]["learner"]["memory"]["count"] == 40
-    )  # two episodes of 20 transitions, none of the 460 free places
 
 
 def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_path):
@@ -425,25 +353,6 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
     refused(found | {"format": 2}, "checkpoint.pt has checkpoint format 2; this version reads format 5")
-
-
-class Observant(LinearQuadratic):
-    """The plant with one more observation, which none of its options names."""
-
-    observations = (*LinearQuadratic.observations, Signal(symbol="e", name="again", unit="m"))
-
-    def observe(self, t, state, exogenous):
-        return torch.cat([state, state[..., :1]], -1)
-
-
-def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
-    """The plant's arguments are not options of the run, so only the weights show them."""
-    options = QUICK | {"policy": "mlp", "hidden": (4,)}
-    small_run(tmp_path, episodes=1, **options).train()
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match="weights do not fit"):
-        small_run(tmp_path, episodes=2, plant=Observant(horizon=2.0), resume=True, **options)
-    assert contents(tmp_path) == before
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):

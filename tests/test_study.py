@@ -1,11 +1,9 @@
 """Finished runs beside each other, and the study that makes them: numbers by hand, and small trainings."""
 
-import dataclasses
 import json
 import math
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -120,25 +118,6 @@ def test_what_diverges_costs_infinitely(tmp_path):
     comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()
 
 
-def test_a_panel_of_costs_that_are_all_infinite_is_drawn_empty(tmp_path):
-    folder = leave(tmp_path / "run", seed=0, costs=[NAN, NAN], curve=(NAN, NAN), valve=NAN)
-    comparison = Comparison("tanks", [Row(name="a", runs=[FinishedRun.read(folder)], optimum=math.inf)])
-    assert cells(comparison.table())["a"][2] == "inf"
-    figure = comparison_figure([comparison], "t")
-    figure.canvas.draw()
-    assert figure.axes[0].get_title(loc="left").startswith("tanks")
-
-
-@pytest.mark.parametrize(
-    ("optimum", "shown"), [(-1.0, "+10 %"), (-0.75, "-20 %"), (-0.9, "+0 %"), (2.0, "-145 %"), (0.0, None)]
-)
-def test_costs_below_zero_are_above_their_optimum_as_a_share_of_its_size(tmp_path, optimum, shown):
-    run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[-0.9, -0.9]))
-    comparison = Comparison("tanks", [Row(name="a", runs=[run], optimum=optimum)])
-    header = [cell.strip() for cell in comparison.table().splitlines()[0].strip("|").split("|")]
-    assert dict(zip(header, cells(comparison.table())["a"], strict=True)).get("over the optimum") == shown
-
-
 def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_path):
     first, second = rows(tmp_path)
     found = compare_runs([*first, *second])
@@ -155,14 +134,6 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
     assert numbers["rows"][names[1]]["J_a_ratio"]["ratio"] == 1.0 and numbers["rows"][names[2]]["J_a_ratio"] is None
     assert len(comparison_figure([found], "t").axes) == 2
-
-
-def test_a_comparison_waits_for_no_torchrl(tmp_path):
-    folders = [str(leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 2.0])) for seed in (0, 1)]
-    code = "import sys, rt_torchrl; rt_torchrl.compare_runs(sys.argv[1:]); print('torchrl' in sys.modules)"
-    command = [sys.executable, "-c", code, *folders]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=TINY.parents[1])
-    assert done.stdout.strip() == "False"
 
 
 def test_runs_that_cannot_be_compared_are_refused(tmp_path):
@@ -340,18 +311,6 @@ def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
     assert "Traceback" in log and "1 / 0" in log and "ZeroDivisionError" in log
 
 
-def test_a_failure_is_told_also_where_no_results_can_be_written(tmp_path, capsys, monkeypatch):
-    broken = broken_recipe(tmp_path, "1 / 0")
-
-    def full(*parts):
-        raise OSError("no space left")
-
-    monkeypatch.setattr(study, "comparisons_of", full)
-    with pytest.raises(OSError, match="no space left"):
-        study.studied(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
-    assert "seed-1: ZeroDivisionError: division by zero" in "".join(capsys.readouterr())
-
-
 def test_a_comparison_of_runs_does_not_take_the_place_of_a_study(tmp_path):
     study.main(config(tmp_path / "study", seeds=1, optimum=False))
     kept = (tmp_path / "study" / "study.md").read_bytes()
@@ -417,17 +376,3 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
     (found,) = study.comparisons_of(trainings, searches)
     assert [row.optimum for row in found.rows] == [0.9] * 2
-
-
-def test_a_folder_with_a_run_of_another_recipe_is_refused(tmp_path):
-    made = config(tmp_path / "study", seeds=1, optimum=False)
-    study.studied(made)
-    elsewhere = tmp_path / TINY.name
-    elsewhere.write_text(TINY.read_text())
-    with pytest.raises(ValueError, match=rf"the recipe is {elsewhere} here and was {TINY.resolve()} in the run"):
-        study.studied(dataclasses.replace(made, systems=(f"tiny={elsewhere}",)))
-    # One of version 0.1 does not name its recipe, and is kept.
-    ((training,),) = dataclasses.replace(made, systems=(f"tiny={elsewhere}",)).trainings().values()
-    settings = json.loads((training.folder / "config.json").read_text())
-    (training.folder / "config.json").write_text(json.dumps({**settings, "recipe": None}))
-    assert training.finished()
