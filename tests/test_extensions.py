@@ -215,9 +215,6 @@ class Particular(LinearQuadratic):
     def setpoints(self, states, applied, exogenous):
         return {"x [m]": (states[..., 0] * applied[..., 0], exogenous[..., 0])}
 
-    def categories(self, exogenous):
-        return {"windy": exogenous[:, 0, 0] > 0.0}
-
     def complete_states(self, measured, exogenous, actions):
         return torch.stack([measured["position"], measured["position"] + 1.0], -1)
 
@@ -273,7 +270,6 @@ def test_whatever_a_plant_overrides_holds_under_every_extension(kind):
             base.merit(plant.true_state(states), acting, exogenous),
         ),
         "setpoints": (plant.setpoints(now, applied, exogenous), base.setpoints(true, acting, exogenous)),
-        "categories": (plant.categories(exogenous), base.categories(exogenous)),
         "discrepancy": (
             plant.discrepancy(now, 0.5 * now),
             base.discrepancy(read, plant.split(0.5 * now)[0]),

@@ -21,13 +21,13 @@ from rt_torchrl.envs.wind_turbine import figures as turbine_figures
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown
-from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import flights
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES
 from rt_torchrl.figures.training import RESOLUTION, visited_observations
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs.results import episode_record, merit_lines, results
+from rt_torchrl.runs.results import episode_record
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
@@ -275,50 +275,26 @@ def judged(*names):
 
 
 def test_every_episode_is_a_point_and_every_mean_a_bar():
-    found, strong = judged("model_based", "model_free", "PD"), torch.arange(COUNT) < 3
-    figure = figures.unseen(found, {"weak": ~strong, "strong": strong})
+    found = judged("model_based", "model_free", "PD")
+    figure = figures.unseen(found)
     draw(figure)
     assert len(figure.axes) == 2
     for ax, pick in zip(figure.axes, ("costs", "merit"), strict=True):
-        shown = [line for line in ax.lines if line.get_marker() in ("o", "^") and len(line.get_ydata())]
+        shown = [line for line in ax.lines if line.get_marker() == "o"]
         bars = [line for line in ax.lines if line.get_marker() == "None"]
         for column, (who, values) in enumerate(found.items()):
             expected = values.control_costs if pick == "costs" else values.merit["final distance [m]"]
-            weak, hard = shown[2 * column : 2 * column + 2]
-            assert np.array_equal(weak.get_ydata(), expected[3:]) and np.array_equal(hard.get_ydata(), expected[:3])
+            assert np.array_equal(shown[column].get_ydata(), expected)
             assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
-            assert (np.abs(weak.get_xdata() - column) < 0.3).all()
-    assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
+            assert (np.abs(shown[column].get_xdata() - column) < 0.3).all()
 
 
 @pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (-0.5, "linear")])
 def test_only_positive_costs_have_a_logarithmic_axis(oscillator, least, scale):
     found = judged("model_based", "model_free", "on-off", "Jonkman")
     found["Jonkman"].control_costs[0] = least
-    figure = figures.unseen(found, {})
+    figure = figures.unseen(found)
     draw(figure)
     assert not collisions(figure) and figure.axes[0].get_yscale() == scale
     episodes = [{"real_cost": cost, "J_p": 1.0} for cost in (1.0, least)]
     assert figures.learning_curves(replace(oscillator, episodes=episodes)).axes[0].get_yscale() == scale
-
-
-def test_kinds_of_episodes_are_counted_and_averaged_apart():
-    plant = FlappingWing(horizon=2.0)
-    unseen = UnseenEpisodes(plant, COUNT)
-    unseen.exogenous = torch.full_like(unseen.exogenous, 1.0)
-    # Too strong in the last second of three episodes; strong, but early enough, in a fourth.
-    unseen.exogenous[:3, -10:] = plant.strongest_wind + 0.01
-    unseen.exogenous[3, :100] = 9.0
-    found = judged("model_based", "model_free")
-    apart = results(unseen, found)["categories"]
-    assert {kind: part["episodes"] for kind, part in apart.items()} == {
-        "gust can be held": 9,
-        "gust too strong to hold": 3,
-    }
-    strong = apart["gust too strong to hold"]["model_free"]
-    assert np.isclose(strong["J_a"]["mean"], found["model_free"].control_costs[:3].mean().item())
-    median = found["model_free"].merit["final distance [m]"][:3].median().item()
-    assert strong["merit"]["final distance [m]"]["median"] == median
-    lines = merit_lines({"episodes": COUNT, "judged_on": unseen.judged_on, **results(unseen, found)})
-    assert any("gust too strong to hold, 3 of 12 episodes" in line for line in lines)
-    assert sum("final distance" in line for line in lines) == 3

@@ -14,7 +14,7 @@ from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
@@ -141,15 +141,6 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     policy = run.algorithm.policies[live]
     for observation, applied in rig.flights[3] + rig.flights[4]:
         torch.testing.assert_close(applied, policy(observation).detach(), rtol=1e-9, atol=1e-12)
-
-
-def test_real_flights_are_not_sorted_by_inputs_that_nobody_has_met():
-    class Sorted(LinearQuadratic):
-        def categories(self, exogenous):
-            return {"all": torch.ones(len(exogenous), dtype=torch.bool)}
-
-    plant = Sorted(horizon=2.0)
-    assert UnseenEpisodes(plant, 2).categories()["all"].all() and RealEpisodes(connected(plant), 2).categories() == {}
 
 
 class Tracking(PD):

@@ -46,15 +46,10 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert {"states.png", "learning_curves.png"} <= {path.name for path in (tmp_path / "figures").iterdir()}
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    logged = [event.value for event in events.Scalars("twin/J_p after assimilation")]
+    logged = [event.value for event in events.Scalars("twin/J_p")]
     # TensorBoard keeps single precision.
     records = metrics["episodes"]
     assert logged == pytest.approx([record["J_p"] for record in records], rel=1e-6)
-    for role in ("model-based", "model-free"):
-        flown = [one["real_cost"] for one in records if one["live"] == role.replace("-", "_")]
-        tag = f"cost/real episode ({role})"
-        assert bool(flown) == (tag in events.Tags()["scalars"])
-        assert not flown or [event.value for event in events.Scalars(tag)] == pytest.approx(flown, rel=1e-6)
     each = summary["unseen"]["J_p_each"]
     assert len(each) == 3 and sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
 

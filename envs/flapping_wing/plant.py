@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.flapping_wing import unknown
@@ -431,15 +431,6 @@ class FlappingWing(Plant):
             "wing power [-]": ((applied[..., 0] / HOVER_AMPLITUDE) ** 3).mean(-1),
             "stroke plane travel [deg/s]": applied[..., 1].diff(dim=-1).abs().mean(-1) / self.dt,
         }
-
-    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
-        """Whether the stroke plane can turn far enough for the wind of the last second, when the drone should hover.
-
-        In a stronger gust every policy is blown away from the target, and the distance says nothing of the policy.
-        """
-        last = round(1.0 / self.dt)
-        held = exogenous[:, -last:, 0].amax(-1) <= self.strongest_wind
-        return {"gust can be held": held, "gust too strong to hold": ~held}
 
     def setpoints(self, states: State, applied: Action, exogenous: Input) -> dict[str, tuple[Scalar, Scalar]]:
         """Both coordinates, with those of the target."""

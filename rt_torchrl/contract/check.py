@@ -31,7 +31,7 @@ ANYWHERE = (
     "It must work for every leading dimension, under vmap and jacrev of torch.func; call .eval() on layers that "
     "normalise a batch."
 )
-REMEDIES = dict.fromkeys(("merit", "categories", "setpoints"), EPISODES)
+REMEDIES = dict.fromkeys(("merit", "setpoints"), EPISODES)
 
 
 class ContractReport(NamedTuple):

@@ -206,7 +206,7 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
 
 @torch.no_grad()
 def judgement(calls: Calls) -> Iterator[str]:
-    """Violations in merit, categories and setpoints of whole episodes."""
+    """Violations in merit and setpoints of whole episodes."""
     state, applied, exogenous = (calls.arguments[name].transpose(0, 1) for name in ("state", "applied", "exogenous"))
     batch = len(state)
     for key, pair in calls.plant.setpoints(state, applied, exogenous).items():
@@ -216,15 +216,10 @@ def judgement(calls: Calls) -> Iterator[str]:
                     f"setpoints: the {what} of {key!r} has {problem} for {batch} episodes of {state.shape[1]} control "
                     f"intervals; expected {wanted_as(state.shape[:2])}."
                 )
-    judged = {
-        "merit": (calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]), torch.float64),
-        "categories": (calls.plant.categories(exogenous), torch.bool),
-    }
-    for name, (quantities, dtype) in judged.items():
-        for key, value in quantities.items():
-            if not isinstance(value, Tensor) or tuple(value.shape) != (batch,) or value.dtype != dtype:
-                given = f"{tuple(value.shape)} in {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
-                yield f"{name}: {key!r} is {given} for {batch} episodes; expected shape ({batch},) in {dtype}."
+    for key, value in calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]).items():
+        if not isinstance(value, Tensor) or tuple(value.shape) != (batch,) or value.dtype != torch.float64:
+            given = f"{tuple(value.shape)} in {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+            yield f"merit: {key!r} is {given} for {batch} episodes; expected shape ({batch},) in torch.float64."
 
 
 @torch.no_grad()

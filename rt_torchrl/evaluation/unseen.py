@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
@@ -163,10 +163,6 @@ class UnseenEpisodes:
         found = plant.merit(flown.states, flown.actions, flown.exogenous)
         return Judged(costs, found | (self.bounds.merit(flown.states) if self.bounds else {}))
 
-    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
-        """The kinds of episodes for which this plant's results are also shown separately."""
-        return self.plant.categories(self.exogenous)
-
     @torch.no_grad()
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
@@ -297,10 +293,6 @@ class RealEpisodes(UnseenEpisodes):
         live.begin(policy, strength=0.0)
         return TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
-    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
-        """No categories, because the exogenous inputs need not be the same each time."""
-        return {}
-
 
 class Judged(NamedTuple):
     """J_a and the plant's own quantities of each unseen episode under one controller."""
@@ -308,18 +300,13 @@ class Judged(NamedTuple):
     control_costs: Costs
     merit: dict[str, Costs]
 
-    def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
-        """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median.
-
-        Args:
-            chosen: episodes to take; None for all.
-        """
-        chosen = torch.ones_like(self.control_costs, dtype=torch.bool) if chosen is None else chosen
+    def statistics(self) -> dict[str, Any]:
+        """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median."""
         merit = {
-            name: mean_with_confidence(values[chosen]) | {"median": values[chosen].median().item()}
+            name: mean_with_confidence(values) | {"median": values.median().item()}
             for name, values in self.merit.items()
         }
-        return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
+        return {"J_a": mean_with_confidence(self.control_costs), "merit": merit}
 
 
 def mean_with_confidence(values: Float[Tensor, " n"]) -> dict[str, Any]:

@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import style
@@ -19,8 +17,6 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 OTHERS = ("0.35", "#CC79A7", "#7f3c8d", "#a0522d")
 """Colours of controllers that are no policies."""
 COLOURS: Mapping[str, str] = {str(role): colour for role, colour in ROLES.items()}
-MARKERS = ("o", "^", "s", "D")
-"""Marker of each kind of episodes."""
 WIDEST_LINEAR = 30.0
 """Ratio of the greatest to the least value above which a panel is logarithmic."""
 
@@ -70,42 +66,33 @@ def _held(plant: Plant, one: Trajectory) -> dict[str, tuple[np.ndarray, np.ndarr
     return {signal.label: (array(states[:, k]), None) for k, signal in enumerate(plant.states)}
 
 
-def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]], *, where: str = "") -> Figure:
+def unseen(judged: Mapping[str, Judged], *, where: str = "") -> Figure:
     """J_a and every quantity of the plant's merit by controller, a point for each episode and a bar at each mean.
 
     Args:
         judged: results of each controller by name, with the policies first.
-        categories: episodes of each kind by name; each kind has its own marker.
         where: words of the title that say where the episodes were flown, such as "on the twin".
     """
     first = next(iter(judged.values()))
     quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
     quantities |= {name: {who: found.merit[name] for who, found in judged.items()} for name in first.merit}
-    count = len(first.control_costs)
     place = f" {where}" if where else ""
     between = " " if first.merit else "\n"  # a single panel is narrower than the title in one line
-    title = f"{count} unseen episodes{place},{between}a point each; bar: mean"
+    title = f"{len(first.control_costs)} unseen episodes{place},{between}a point each; bar: mean"
     figure, axes = panels(1, len(quantities), title=title, size=(max(4.5, 3.1 * len(quantities)), 4.2))
-    kinds = {kind: array(chosen) for kind, chosen in categories.items()} or {"": np.ones(count, dtype=bool)}
     for ax, (name, values) in zip(axes.flat, quantities.items(), strict=True):
-        _strip(ax, {who: array(found) for who, found in values.items()}, kinds)
+        _strip(ax, {who: array(found) for who, found in values.items()})
         caption(ax, name)
-    if categories:
-        # The legend is grey, because the marker tells the kind and the colour tells the controller.
-        for marker, kind in zip(MARKERS, kinds, strict=False):
-            axes[0, 0].plot([], [], marker, color="0.4", markersize=6, markeredgewidth=0.0, label=kind)
-        legend_below(figure, [axes[0, 0]])
     return figure
 
 
-def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]) -> None:
+def _strip(ax: Axes, values: Mapping[str, np.ndarray]) -> None:
     """Draw a column of points for each controller, spread sideways so that they do not hide each other."""
     rng = np.random.default_rng(0)
     for column, (who, found) in enumerate(values.items()):
         place = column + 0.25 * rng.uniform(-1.0, 1.0, len(found))
         look: dict[str, Any] = {"color": COLOURS.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5}
-        for marker, chosen in zip(MARKERS, kinds.values(), strict=False):
-            ax.plot(place[chosen], found[chosen], marker, markeredgewidth=0.0, **look)
+        ax.plot(place, found, "o", markeredgewidth=0.0, **look)
         ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
     style.logarithmic_if_wide(ax, WIDEST_LINEAR)
     # Names take two lines, because four of them beside each other are wider than a panel.

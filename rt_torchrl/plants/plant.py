@@ -25,7 +25,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.policies import SaturatedAffine
@@ -46,7 +46,7 @@ REQUIRED = ("vector_field", "running_cost", "draw_initial_state", "draw_exogenou
 PARTS = {
     "controller": ("observe", "actuate", "controller_start", "make_policy"),
     "memory": ("latch",),
-    "task": ("running_cost", "terminal_cost", "ended", "merit", "setpoints", "categories", "draw_exogenous"),
+    "task": ("running_cost", "terminal_cost", "ended", "merit", "setpoints", "draw_exogenous"),
     "start": ("at_rest", "complete_states", "draw_initial_state"),
     "closure": ("make_closure", "make_neural_closure"),
 }
@@ -284,10 +284,6 @@ class Plant(nn.Module):
 
     def setpoints(self, states: State, applied: Action, exogenous: Input) -> dict[str, tuple[Cost, Cost]]:
         """Quantities to be held, named with their units: value and setpoint in each interval; by default none."""
-        return {}
-
-    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
-        """Kinds of episodes, by name, for which results are also shown separately; by default none."""
         return {}
 
     def complete_states(

@@ -12,49 +12,11 @@ from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
 from rt_torchrl.steps.config import ROLES
 
-TAGS = {
-    "real_cost": "cost/real episode (live policy)",
-    "J_a_model_based": "cost/J_a model-based (twin)",
-    "J_a_model_free": "cost/J_a model-free (twin)",
-    "J_a_unseen": "cost/J_a live policy (real system, unseen episodes)",
-    "J_a_unseen_on_the_twin": "cost/J_a live policy (twin, unseen episodes)",
-    "J_a_plan_before": "cost/expected J_a before planning",
-    "J_a_plan": "cost/expected J_a after planning",
-    "plan_accepted": "switch/plan accepted",
-    "start": "switch/start of the plan that stays",
-    "J_p_before": "twin/J_p before assimilation",
-    "J_p": "twin/J_p after assimilation",
-    "closure_refused": "twin/closure refused",
-    "closure_gradient": "gradient norm/closure (J_p)",
-    "policy_gradient": "gradient norm/model-based policy (J_a)",
-    "actor_gradient": "gradient norm/model-free policy",
-    "critic_gradient": "gradient norm/critic",
-    "reward": "model-free/mean reward",
-    "td_error": "model-free/mean absolute TD error",
-    "critic_loss": "model-free/critic loss",
-    "value": "model-free/mean value of the policy",
-    "exploration": "model-free/exploration strength",
-    "ended_after": "cost/control intervals until the early end of the real episode",
-    "solve_median": "predictive control/median time of a solve (ms)",
-    "solve_max": "predictive control/longest solve (ms)",
-    "diverged_solves": "predictive control/solves whose model diverged",
-    "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
-    "alarm": "twin/alarm: the twin is wrong where it matters",
-    "predicted_violations": "violations/predicted share of intervals (twin, the policy that acts)",
-    "weight_change": "switch/relative weight change of the idle policy",
-    "distillation_error": "switch/RMS action error of a distilled clone, share of range",
-    "distillation_cost_ratio": "switch/J_a of a distilled clone over that of the live policy (twin)",
-}
-"""Tag of each scalar entry of an episode's record."""
-
-
 GROUPS = {
-    "hypothesis/": "hypotheses/weight/",
-    "misfit/": "hypotheses/misfit/",
-    "rms/": "twin/rms/",
-    **{kind: kind for kind in ("faults/", "violations/", "excess/", "multiplier/")},
+    "cost": ("real_cost", "start_cost", "J_a_", "ended_after"),
+    "twin": ("J_p", "paired_difference", "alarm", "closure_"),
 }
-"""Tags of entries of which an episode has several, by what they begin with."""
+"""Groups of curves, with what the names of their entries in ``metrics.json`` begin with; others are of the steps."""
 
 
 class Dashboard:
@@ -106,14 +68,15 @@ class Dashboard:
 
 
 def scalars_of(record: Mapping[str, Any]) -> dict[str, float]:
-    """The scalars of an episode by tag, from its entry in ``metrics.json``."""
-    found = {tag: record[key] for key, tag in TAGS.items() if key in record}
-    found[f"cost/real episode ({record['live'].replace('_', '-')})"] = record["real_cost"]
+    """The scalars of an episode by tag: a group and the name in ``metrics.json``, which may have a group of its own."""
+    found = {}
+    for name, value in record.items():
+        if isinstance(value, float):
+            group = next((group for group, begins in GROUPS.items() if name.startswith(begins)), "steps")
+            found[name if "/" in name else f"{group}/{name}"] = value
     found["switch/live is model-based"] = float(record["live"] == "model_based")
     found |= {f"switch/{event}": float(record.get("event") == event) for event in ("swap", "clone")}
     found |= {f"closure/{name}": w for name, w in (record["closure"] or {}).items() if isinstance(w, float)}
-    for prefix, group in GROUPS.items():
-        found |= {key.replace(prefix, group): value for key, value in record.items() if key.startswith(prefix)}
     return found | {f"seconds/{name}": seconds for name, seconds in record["seconds"].items()}
 
 

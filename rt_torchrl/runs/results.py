@@ -103,7 +103,7 @@ def summarise(
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
         "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on, "J_p_each": J_p.tolist()}
         | {name: mean_with_confidence(values) for name, values in means.items()}
-        | results(unseen, judged),
+        | results(judged),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
         "better": better_of(algorithm, unseen),
@@ -159,19 +159,14 @@ def twin_costs(
     return [unseen.identification_costs(physics, closure, flown, segment) for physics, closure in laws]
 
 
-def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
-    """Statistics of all controllers on all unseen episodes, and on each kind of these episodes."""
+def results(judged: dict[str, Judged]) -> dict[str, Any]:
+    """Statistics of all controllers on the unseen episodes."""
     overall = {name: found.statistics() for name, found in judged.items()}
-    kinds = {name: chosen for name, chosen in unseen.categories().items() if chosen.sum() > 1}
     return {
         **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
         "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
         "merit": {role: overall[role]["merit"] for role in ROLES},
         "baselines": {name: found for name, found in overall.items() if name not in ROLES},
-        "categories": {
-            kind: {"episodes": int(chosen.sum())} | {name: found.statistics(chosen) for name, found in judged.items()}
-            for kind, chosen in kinds.items()
-        },
     }
 
 
@@ -347,26 +342,15 @@ def _interval(found: dict[str, Any]) -> str:
 
 
 def merit_lines(unseen: dict[str, Any]) -> list[str]:
-    """Lines with the plant's own quantities under every controller: over all episodes, then over each kind with J_a."""
+    """Lines with the plant's own quantities under every controller."""
     merits: dict[str, dict[str, Any]] = {role: unseen["merit"][role] for role in ROLES}
     merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
     if not merits[ROLES[0]]:
         return []
     heading = "on the twin, mean (median)" if on_the_twin(unseen) else "mean (median)"
     lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
-    lines += _rows(merits)
-    for kind, found in unseen["categories"].items():
-        lines.append(f"  {kind}, {found['episodes']} of {unseen['episodes']} episodes")
-        lines += _rows({name: {"J_a": found[name]["J_a"]} | found[name]["merit"] for name in merits})
-    return lines
-
-
-def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
-    """Lines of a table, one for each quantity."""
-    lines = []
-    for name in next(iter(columns.values())):
-        shown = (_value(merit[name]) for merit in columns.values())
-        lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
+    for name in merits[ROLES[0]]:
+        lines.append(f"    {name:<26}" + "".join(f"{_value(merit[name]):>20}" for merit in merits.values()))
     return lines
 
 

@@ -259,7 +259,7 @@ class Run:
                 bar.doing("drawing the figures")
                 flown = first_flights(self.unseen, self.algorithm.referee.live, flights)
                 where = "on the twin" if self.unseen.judged_on == "twin" else ""
-                unseen = {"unseen": figures.unseen(judged, self.unseen.categories(), where=where)}
+                unseen = {"unseen": figures.unseen(judged, where=where)}
                 folder = self.folder / "figures"
                 images = self._pixels(flown | unseen)
                 folder.mkdir(exist_ok=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import rt_torchrl
 from rt_torchrl.atomic_file import read_json, write_atomically
 from rt_torchrl.runs.run_config import RunConfig
 
@@ -113,7 +114,7 @@ def _origin(config_class: type) -> dict[str, str | None]:
     return {"class": config_class.__qualname__, "file": str(Path(file).resolve()) if file else None}
 
 
-VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
+VERSIONS_OF = ("torch", "torchrl", "tensordict")
 OF_THE_CALL = ("config", "log_dir", "resume")
 """Options that a file of options never gives."""
 BESIDE_TRAINING = {"figures", "reference", "threads", *OF_THE_CALL}
@@ -147,15 +148,10 @@ def write_settings(folder: Path, asked: RunConfig, effective: RunConfig, plant: 
     write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
 
 
-def versions() -> dict[str, str | None]:
-    """Versions of Python, this library and the libraries it computes with; None for one that is not a package."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for name in VERSIONS_OF:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+def versions() -> dict[str, str]:
+    """Versions of Python, this library and the libraries it computes with."""
+    found = {"python": platform.python_version(), "rt_torchrl": rt_torchrl.__version__}
+    return found | {name: importlib.metadata.version(name) for name in VERSIONS_OF}
 
 
 def as_written(config: RunConfig) -> dict[str, Any]:
