@@ -63,7 +63,7 @@ def started(server, folder, plant=None, kill_at=None, **options):
 
 def deterministic(folder):
     """The episodes of a run's checkpoint, without what depends on the clock."""
-    return [{**record, "seconds": None} for record in load_tensors(folder / "checkpoint.pt")["episodes"]]
+    return [{**record, "seconds": None} for record in load_tensors(run_folder.checkpoints(folder)[0])["episodes"]]
 
 
 def require_resumed(server, folder, undisturbed, plant=None, **options):
@@ -162,14 +162,14 @@ def kept(tmp_path_factory):
     """A run of which three checkpoints are kept, with the states in them."""
     folder = tmp_path_factory.mktemp("kept")
     small_run(folder, episodes=EPISODES, **QUICK).train()
-    files = [folder / "checkpoint.pt", *run_folder.earlier(folder / "checkpoint.pt")]
-    assert [file.name for file in files] == ["checkpoint.pt", "checkpoint-0004.pt", "checkpoint-0003.pt"]
+    files = run_folder.checkpoints(folder)
+    assert [file.name for file in files] == [f"checkpoint-000{k}.pt" for k in (5, 4, 3)]
     return files, [load_tensors(file)["state"]["algorithm"] for file in files]
 
 
 @pytest.mark.parametrize("numbers", [range(6), pytest.param(range(6, 240), marks=pytest.mark.faults)])
 def test_a_damaged_checkpoint_is_replaced_by_the_one_before(kept, numbers, tmp_path, capsys):
-    (files, states), trace, path = kept, tmp_path / "trace", tmp_path / "checkpoint.pt"
+    (files, states), trace, path = kept, tmp_path / "trace", tmp_path / "checkpoint-0005.pt"
     algorithm = small_run(tmp_path / "run", episodes=EPISODES, **QUICK).algorithm
     for number in numbers:
         content, alone = broken(files[0].read_bytes(), number, trace), number % 5 == 4
@@ -181,19 +181,19 @@ def test_a_damaged_checkpoint_is_replaced_by_the_one_before(kept, numbers, tmp_p
         capsys.readouterr()
         episodes, refusal = [], ""
         try:
-            episodes = run_folder.load_checkpoint(path, algorithm)
+            episodes = run_folder.load_checkpoint(tmp_path, algorithm)
         except ValueError as error:
             refusal = str(error)
         said, state = capsys.readouterr().out, plain(algorithm.state_dict())
         if refusal:
-            assert alone and "checkpoint.pt" in refusal and "choose another folder" in refusal
+            assert alone and path.name in refusal and "choose another folder" in refusal
         elif len(episodes) == EPISODES:  # the damage has no effect on the content
             assert same(state, states[0]) and not said
         else:
             assert len(episodes) == EPISODES - 1 and same(state, states[1])
             assert "goes on from checkpoint-0004.pt, after 4 episodes" in said
-            assert (tmp_path / "checkpoint.pt.damaged").read_bytes() == content and not path.exists()
-        (tmp_path / "checkpoint.pt.damaged").unlink(missing_ok=True)
+            assert (tmp_path / f"{path.name}.damaged").read_bytes() == content and not path.exists()
+        (tmp_path / f"{path.name}.damaged").unlink(missing_ok=True)
         assert not trace.exists()
 
 
@@ -201,7 +201,7 @@ def test_after_a_fall_back_the_training_is_the_same_to_the_bit(tmp_path, kept):
     files, _ = kept
     for file in files[0].parent.glob("c*"):
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    (tmp_path / "checkpoint.pt").write_bytes(files[0].read_bytes()[:-500])
+    (tmp_path / "checkpoint-0005.pt").write_bytes(files[0].read_bytes()[:-500])
     (tmp_path / "checkpoint-0004.pt").write_bytes(b"")
     small_run(tmp_path, episodes=EPISODES, resume=True, **QUICK).train()
     assert deterministic(tmp_path) == deterministic(files[0].parent)
@@ -222,7 +222,7 @@ def test_a_file_system_that_is_full_leaves_what_was_done(server, tmp_path, whole
         pytest.skip("a small file system cannot be mounted here")
     try:
         started(server, tmp_path).join()
-        done = deterministic(tmp_path) if (tmp_path / "checkpoint.pt").exists() else []
+        done = deterministic(tmp_path) if run_folder.checkpoints(tmp_path) else []
         assert done == undisturbed[1][: len(done)]
         subprocess.run([*mount, "remount,size=64m", tmp_path], check=True)
         require_resumed(server, tmp_path, undisturbed)

@@ -146,7 +146,7 @@ class Holder:
 
 
 def read_checkpoint(path):
-    assert run_folder.load_checkpoint(path, Holder()) == [{"episode": 0}]
+    assert run_folder.load_checkpoint(path.parent, Holder()) == [{"episode": 0}]
 
 
 def read_config(path):
@@ -164,8 +164,10 @@ READERS = {
     "weights.pt": Reader(
         "weights.pt", lambda: written("weights.pt", lambda p: save_tensors(p, weights())), read_weights
     ),
-    "checkpoint.pt": Reader(
-        "checkpoint.pt", lambda: written("checkpoint.pt", lambda p: save_tensors(p, content())), read_checkpoint
+    "checkpoint-0001.pt": Reader(
+        "checkpoint-0001.pt",
+        lambda: written("checkpoint-0001.pt", lambda p: save_tensors(p, content())),
+        read_checkpoint,
     ),
     "config.json": Reader(
         "config.json",

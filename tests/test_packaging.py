@@ -274,7 +274,7 @@ class Done(BaseException):
     pass
 
 def until_checkpoint(path, content):
-    if path.name == "checkpoint.pt":  # which is written at the end of an episode
+    if path.match("checkpoint-*.pt"):  # which is written at the end of an episode
         raise Done
     write(path, content)
 

@@ -91,7 +91,7 @@ def test_what_cannot_be_resumed_is_refused(tmp_path):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
     begun(tmp_path)
     (tmp_path / "weights.pt").touch()
-    with pytest.raises(ValueError, match="finished run without its checkpoint.pt.*another folder"):
+    with pytest.raises(ValueError, match="finished run without a checkpoint.*another folder"):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(ValueError, match="config.json is damaged"):
@@ -281,17 +281,17 @@ def folder(tmp_path_factory):
 
 
 def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_path):
-    whole, generator = (folder / "checkpoint.pt").read_bytes(), np.random.default_rng(1)
+    whole, generator = (folder / "checkpoint-0002.pt").read_bytes(), np.random.default_rng(1)
     (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
     before = (tmp_path / "config.json").read_bytes()
     for length in generator.integers(0, len(whole), 5):
-        (tmp_path / "checkpoint.pt").write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged.*train anew, choose another folder"):
+        (tmp_path / "checkpoint-0002.pt").write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"checkpoint-0002\.pt is damaged.*train anew, choose another folder"):
             small_run(tmp_path, resume=True, **QUICK)
     middle = bytearray(whole)
     middle[whole.index(b"PK\x03\x04", len(whole) // 2) - 100] ^= 1  # within a tensor: parts follow each other
-    (tmp_path / "checkpoint.pt").write_bytes(bytes(middle))
-    with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
+    (tmp_path / "checkpoint-0002.pt").write_bytes(bytes(middle))
+    with pytest.raises(ValueError, match=r"checkpoint-0002\.pt is damaged"):
         small_run(tmp_path, resume=True, **QUICK)
     assert (tmp_path / "config.json").read_bytes() == before
 
@@ -321,14 +321,14 @@ def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
 ):
     """The earlier checkpoint would be sound: a training that took it would fly an episode again."""
     algorithm = small_run(tmp_path / "run", **QUICK).algorithm
-    for name in ("checkpoint.pt", "checkpoint-0001.pt"):
-        (tmp_path / name).write_bytes((folder / "checkpoint.pt").read_bytes())
+    for name in ("checkpoint-0002.pt", "checkpoint-0001.pt"):
+        (tmp_path / name).write_bytes((folder / "checkpoint-0002.pt").read_bytes())
     with monkeypatch.context() as patched:
         patched.setattr(*where, failing)
-        with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint\.pt"):
-            run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)
-    assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint.pt"]
-    assert len(run_folder.load_checkpoint(tmp_path / "checkpoint.pt", algorithm)) == 2
+        with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint-0002\.pt"):
+            run_folder.load_checkpoint(tmp_path, algorithm)
+    assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint-0002.pt"]
+    assert len(run_folder.load_checkpoint(tmp_path, algorithm)) == 2
 
 
 PARTS = [
@@ -338,12 +338,12 @@ PARTS = [
 
 
 def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, tmp_path):
-    algorithm, file = small_run(tmp_path / "run", **QUICK).algorithm, tmp_path / "checkpoint.pt"
+    algorithm, file = small_run(tmp_path / "run", **QUICK).algorithm, tmp_path / "checkpoint-0002.pt"
 
     def refused(changed, message):
         save_tensors(file, changed)
         with pytest.raises(ValueError, match=message):
-            run_folder.load_checkpoint(file, algorithm)
+            run_folder.load_checkpoint(tmp_path, algorithm)
 
     for step, part in PARTS:
         found = load_tensors(folder / file.name)
@@ -352,7 +352,7 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
-    refused(found | {"format": 2}, "checkpoint.pt has checkpoint format 2; this version reads format 5")
+    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 5")
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):

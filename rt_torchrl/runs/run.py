@@ -151,7 +151,7 @@ class Run:
             self._paid: list[float | None] = []
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
-                self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
+                self.episodes = load_checkpoint(self.folder, self.algorithm)
             elif real is not None and config.preflight:
                 self.algorithm.flights.check = self._require_wiring
             self._doubts: tuple[str, ...] = ()
@@ -310,7 +310,7 @@ class Run:
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
         done = [*self.episodes, record]
-        short = save_checkpoint(self._held.checkpoint, self.algorithm, done)
+        short = save_checkpoint(self.folder, self.algorithm, done)
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
@@ -324,7 +324,7 @@ class Run:
     def _drop_half_an_episode(self) -> None:
         """Go back to the end of the last whole episode after an interrupt."""
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
-            self.episodes = load_checkpoint(self._held.checkpoint, self.algorithm)
+            self.episodes = load_checkpoint(self.folder, self.algorithm)
 
     def _fly_the_real_system(self, bar: Progress) -> dict[str, RealFlights]:
         """The flights after the training that were asked for; before the first one the run says how many of whom."""

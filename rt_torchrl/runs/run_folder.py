@@ -5,7 +5,6 @@ import hashlib
 import io
 import os
 import pickle
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,23 +137,19 @@ def _base(value: float | str) -> float | str:
     return next(kind(value) for kind in (float, int, str) if isinstance(value, kind))
 
 
-CHECKPOINT = "checkpoint.pt"
-"""File of the newest checkpoint in a run folder."""
 FORMAT = 5
 KEPT = 3
 """Number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before."""
-NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
-"""Name of an earlier checkpoint."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk and of a used quota."""
 ANEW = "To train anew, choose another folder."
 
 
-def save_checkpoint(path: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> str | None:
-    """Write a checkpoint; the earlier checkpoint stays intact until the new one is complete.
+def save_checkpoint(folder: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> str | None:
+    """Write a checkpoint, whose name has the number of episodes; earlier ones stay until it is complete.
 
     Args:
-        path: file of the newest checkpoint. Earlier ones lie beside it, with their number of episodes in their name.
+        folder: run folder.
         algorithm: algorithm to save.
         episodes: records of the episodes that are done.
 
@@ -170,50 +165,40 @@ def save_checkpoint(path: Path, algorithm: "ReinforcementTwinning", episodes: li
         "episodes": episodes,
         "state": {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()},
     }
-    if path.is_file():
-        _keep(path, len(episodes) - 1)
+    path, older = folder / f"checkpoint-{len(episodes):04d}.pt", checkpoints(folder)[1:]
     try:
         save_tensors(path, content)
     except OSError as error:
-        older = earlier(path)
         if error.errno not in FULL or not older:
             raise
         for old in older:
             old.unlink(missing_ok=True)
         save_tensors(path, content)
-        return f"the disk of {path.parent} is full; {len(older)} earlier checkpoints went to save the present one"
-    for old in earlier(path)[KEPT - 1 :]:
+        return f"the disk of {folder} is full; {len(older)} earlier checkpoints went to save the present one"
+    for old in checkpoints(folder)[KEPT:]:
         old.unlink(missing_ok=True)
     return None
 
 
-def earlier(path: Path) -> list[Path]:
-    """The checkpoints beside the newest one, latest first."""
-    found = {file: NUMBERED.fullmatch(file.name) for file in path.parent.glob(f"{path.stem}-*{path.suffix}")}
-    numbers = {file: int(match["episodes"]) for file, match in found.items() if match}
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a run, latest first."""
+    found = {file: file.stem.removeprefix("checkpoint-") for file in folder.glob("checkpoint-*.pt")}
+    numbers = {file: int(number) for file, number in found.items() if number.isdecimal()}
     return sorted(numbers, key=numbers.__getitem__, reverse=True)
 
 
-def has_checkpoint(path: Path) -> bool:
-    """Whether there is a checkpoint to go on from, at ``path`` or an earlier one beside it."""
-    return path.is_file() or bool(earlier(path))
-
-
-def load_checkpoint(path: Path, algorithm: "ReinforcementTwinning") -> list[dict[str, Any]]:
+def load_checkpoint(folder: Path, algorithm: "ReinforcementTwinning") -> list[dict[str, Any]]:
     """Restore the newest checkpoint that is sound, and return the records of its episodes.
 
-    If that is not the one at ``path``, a line on the terminal says so, and the damaged file is renamed.
+    If that is not the newest of all, a line on the terminal says so, and the damaged files are renamed.
 
     Raises:
         ValueError: if there is no checkpoint, all of them are damaged, or the newest sound one has another format,
             belongs to another plant, or does not fit.
         OSError: if a checkpoint cannot be read, which does not make it a damaged one; nothing is renamed.
     """
-    candidates = [*([path] if path.is_file() else []), *earlier(path)]
-    if not candidates:
-        raise ValueError(f"there is no checkpoint {path} to go on from.")
     damaged: dict[Path, DamagedFileError] = {}
-    for file in candidates:
+    for file in checkpoints(folder):
         try:
             found = _read(file)
         except DamagedFileError as error:
@@ -225,8 +210,8 @@ def load_checkpoint(path: Path, algorithm: "ReinforcementTwinning") -> list[dict
             raise ValueError(f"{error} {ANEW}") from error
         _set_aside(damaged, file, len(found["episodes"]))
         return found["episodes"]
-    reasons = " ".join(map(str, damaged.values()))
-    raise ValueError(f"{reasons} {ANEW}") from damaged[candidates[0]]
+    reasons = " ".join(map(str, damaged.values())) or f"{folder} holds no checkpoint to go on from."
+    raise ValueError(f"{reasons} {ANEW}")
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -265,20 +250,8 @@ def _set_aside(damaged: dict[Path, DamagedFileError], sound: Path, episodes: int
         print(f"{error} It is now {aside.name}; the training goes on from {sound.name}, after {episodes} episodes.")
 
 
-def _keep(path: Path, episodes: int) -> None:
-    """Keep the newest checkpoint under the name of an earlier one, without a moment in which there is none."""
-    numbered = path.with_name(f"{path.stem}-{episodes:04d}{path.suffix}")
-    numbered.unlink(missing_ok=True)
-    try:
-        os.link(path, numbered)
-    except OSError:
-        if not path.is_file():
-            raise
-        write_atomically(numbered, path.read_bytes())  # a file system without links
-
-
 RESULTS = ("metrics.json", "weights.pt")
-WRITTEN = (*RESULTS, CHECKPOINT, FILE)
+WRITTEN = (*RESULTS, FILE)
 """Files that say that a folder holds a run."""
 
 
@@ -353,20 +326,14 @@ class RunFolder:
         if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         require_same(self.path, self._config)
-        if not has_checkpoint(self.checkpoint) and any((self.path / name).exists() for name in RESULTS):
+        if not checkpoints(self.path) and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(
-                f"log_dir={self.path} holds a finished run without its {self.checkpoint.name}: there is nothing to go "
-                f"on with. {ANEW}"
+                f"log_dir={self.path} holds a finished run without a checkpoint: there is nothing to go on with. {ANEW}"
             )
-
-    @property
-    def checkpoint(self) -> Path:
-        """Path of the newest checkpoint, whether or not it exists yet."""
-        return self.path / CHECKPOINT
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        there = has_checkpoint(self.checkpoint)
+        there = bool(checkpoints(self.path))
         if self._config.resume and not there:
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
         return self._config.resume and there

@@ -18,7 +18,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
-from rt_torchrl.runs.run_folder import CHECKPOINT, has_checkpoint
+from rt_torchrl.runs.run_folder import checkpoints
 from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
@@ -50,7 +50,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start
-    begun = config.resume and config.log_dir is not None and has_checkpoint(config.log_dir / CHECKPOINT)
+    begun = config.resume and config.log_dir is not None and checkpoints(config.log_dir)
     if begun or name == "random":
         return lambda physics, closure: None
     if name == "controller":
