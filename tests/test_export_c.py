@@ -304,9 +304,3 @@ def test_outside_of_a_table_a_look_up_is_not_a_number(tmp_path):
             assert torch.equal(found, table[math.trunc(place)].unsqueeze(0))
         else:
             assert found.isnan().all()
-
-
-@needs_compiler
-def test_what_is_read_may_be_overwritten(tmp_path):
-    x = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    assert compiled(lambda x: x.flip(0) * torch.tensor([1.0, 1.0, 2.0]).double(), x, tmp_path)(x).tolist() == [3, 2, 2]

@@ -110,26 +110,6 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     assert 1e-9 < ((states - ideal).abs() / size).max() < 2e-3
 
 
-@needs_compiler
-def test_commands_are_given_beside_the_limited_actions(tmp_path, monkeypatch):
-    monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
-    plant = WindTurbine()
-    export_controller(law(plant), tmp_path / "turbine.c", plant, name="turbine")
-    in_c = InC(tmp_path / "turbine.c", 2, 5, 2)
-    in_c.start(1.0, 11.0)
-    # Settled filters: ω̂ = N_g ω_r, û = u, e_2 = e_1; the torque is K ω_g².
-    reference = min(max(97.0 * plant.best_tip_speed_ratio * 11.0 / 63.0, 70.16), 122.9096)
-    e = (97.0 - reference) / 20.0
-    torque = min(plant.optimal_gain * 97.0**2, 43_093.55)
-    assert list(in_c.state.memory) == pytest.approx([97.0, 11.0, e, torque, 0.0], rel=1e-12)
-    action = in_c.step(1.0, 11.0)
-    torque_command = 0.5 * (math.tanh(1.4 * e + 0.5) + 1.0) * 43_093.55
-    pitch_command = 0.5 * (math.tanh(0.9 * e - 1.0) + 1.0) * 30.0
-    assert list(in_c.state.command) == pytest.approx([torque_command, pitch_command], rel=1e-12)
-    limited = torque + min(max(torque_command - torque, -7500.0), 7500.0), min(pitch_command, 4.0)
-    assert action == pytest.approx(limited, rel=1e-12)
-
-
 class Lagged(LinearQuadratic):
     """The oracle plant with a filter f of the position and an integral i of the time, which stand between the others.
 

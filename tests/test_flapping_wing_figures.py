@@ -1,8 +1,5 @@
 """The drone's figures against the numbers they are drawn from, on a short flight."""
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +9,6 @@ from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 
@@ -85,23 +81,6 @@ def test_polars_are_those_of_the_closures(snapshot):
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
     assert [ax.get_title(loc="left")[-3:] for ax in (lift, drag)] == ["[-]", "[-]"]
     assert share.get_xlabel().endswith("[deg]")
-
-
-def test_visited_angles_are_those_of_the_kinematics(snapshot):
-    # At rest in calm air the element moves along the stroke alone: alpha_e = alpha - 90 deg or alpha + 90 deg,
-    # from the chord's pitch 45 sin(2 pi f t) deg and the direction of the stroke.
-    record = snapshot.record
-    still = replace(
-        snapshot, record=Trajectory(torch.zeros_like(record.states), record.actions, torch.zeros_like(record.exogenous))
-    )
-    sine, cosine = figures.visited_features(still).T.numpy()
-    phase = 2 * math.pi * 20.0 * 5e-4 * np.arange(len(record.actions))
-    moving = np.abs(np.sin(phase)) > 0.1
-    pitch = math.pi / 4 * np.sin(phase)
-    direction = np.sign(np.sin(phase))
-    # The floor of the speed, 0.01 m/s, shortens the direction by (0.01 / 0.7 m/s)^2 / 2 where the wing is slowest.
-    np.testing.assert_allclose(sine[moving], (direction * np.cos(pitch))[moving], atol=2e-4)
-    np.testing.assert_allclose(cosine[moving], (direction * np.sin(pitch))[moving], atol=2e-4)
 
 
 def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapshot):

@@ -121,51 +121,6 @@ HOMES = {
     for alias in node.names
 }
 """The module that each public name comes from."""
-ROOMS_OF = {
-    "benchmark.py": {"figures", "trajectories"},
-    "cascaded_tanks.py": {"figures", "fit", "runs"},
-    "export.py": {"export", "runs"},
-    "identify.py": {"fit", "figures", "runs"},
-    "paper.py": {"optimisers", "runs", "steps", "systems"},
-    "paper_figures.py": {"figures", "runs", "steps"},
-    "record_log.py": {"fit", "runs"},
-    "served_turbine.py": {"plants"},
-    "study.py": {"atomic_file", "evaluation", "figures", "interruption", "runs", "steps"},
-}
-"""Recipes that are the command line of a room, and the rooms whose internal names they use."""
-
-
-def sources():
-    """The Python that people read first: every recipe, and every code block of the README and the tutorial."""
-    for path in sorted((ROOT / "recipes").glob("*.py")):
-        yield path.name, path.read_text(encoding="utf-8")
-    for path in (ROOT / "README.md", ROOT / "docs" / "own_plant.md"):
-        blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
-        assert blocks, path
-        yield path.name, "\n".join(blocks)
-
-
-def imports_of_rooms(code):
-    """Pairs of a module of the library, not a plant's, and a name that is imported from it."""
-    for node in ast.walk(ast.parse(code)):
-        if isinstance(node, ast.Import):
-            found = [(alias.name, "") for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            found = [(node.module or "", alias.name) for alias in node.names]
-        else:
-            continue
-        for module, name in found:
-            parts = module.split(".")
-            if parts[0] == "rt_torchrl" and parts[1:2] not in ([], ["atomic_file"], ["envs"]):
-                yield module, name
-
-
-@pytest.mark.parametrize(("file", "code"), [pytest.param(*source, id=source[0]) for source in sources()])
-def test_public_names_come_from_the_top(file, code):
-    for module, name in imports_of_rooms(code):
-        assert name not in HOMES, f"{file}: import {name} from rt_torchrl, not from {module}"
-        # Every recipe declares ranges of its options.
-        assert module.split(".")[1] in {"options", *ROOMS_OF.get(file, ())}, f"{file} imports {name} from {module}"
 
 
 @pytest.mark.parametrize("name", sorted(HOMES))

@@ -2,12 +2,9 @@
 
 import dataclasses
 import importlib
-import json
 import math
 import re
-import runpy
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,25 +15,11 @@ from test_export_recipe import RECIPES, recipe
 
 import rt_torchrl
 from rt_torchrl import Plant, rk4_step
-from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.options import File, Limit, Widths, choices, configuration, read_options
+from rt_torchrl.options import File, Limit, Widths, configuration, read_options
 from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import (
-    AssimilationConfig,
-    ExogenousConfig,
-    LearnerConfig,
-    PlannerConfig,
-    RefereeConfig,
-    TwinningConfig,
-)
-from rt_torchrl.systems.config import SafetyConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
-
-HEADER = "! TurbSim\n"
-LINE = "{time:.2f} {speed:g} 0 0 0 0 0 0\n"
 
 
 def made(plant, **options):
@@ -66,15 +49,6 @@ def test_weights_of_another_task_are_refused():
     assert made.Config(task="engineering", engineering=weights).plant().cost == weights
     with pytest.raises(ValueError, match="weights of the task engineering"):
         made.Config(engineering=weights)
-
-
-def test_wind_that_no_turbine_has_met_is_refused(tmp_path):
-    file = tmp_path / "storm.hh"
-    file.write_text(HEADER + "".join(LINE.format(time=0.5 * k, speed=1e42 if k == 7 else 11.0) for k in range(1300)))
-    with pytest.raises(
-        ValueError, match=r"wind_files: .*storm.hh: wind speed at t = 3.5 s is 1e\+42 m/s; it must be from 0 to 200 m/s"
-    ):
-        made("wind_turbine", wind_files=(file,))
 
 
 @pytest.mark.parametrize("plant", ["pendulum", "wind_turbine"])
@@ -132,13 +106,6 @@ def test_presets_of_a_neural_closure_and_of_predictive_control(plant):
     assert dataclasses.replace(neural, preset="default") == of_command_line(plant, "--closure", "mlp")
     assert mpc.twinning.planner == dataclasses.replace(usual.twinning.planner, method="receding_horizon")
     assert dataclasses.replace(mpc, preset="default", twinning=usual.twinning) == usual
-
-
-def test_predictive_control_is_the_default_of_a_task_with_another_method():
-    hop = of_command_line("flapping_wing", "--task", "hop").twinning
-    mpc = of_command_line("flapping_wing", "--task", "hop", "--preset", "mpc").twinning
-    assert mpc == dataclasses.replace(hop, planner=mpc.planner) and mpc.planner.method == "receding_horizon"
-    assert mpc.planner.realisations == hop.planner.realisations == 40
 
 
 def test_a_plant_without_a_paper_has_no_words_of_it():
@@ -246,19 +213,6 @@ def test_what_an_option_cannot_be_is_refused_in_code_and_in_a_file(options, mess
             read_options(Example, options)
 
 
-def test_a_nested_option_is_named_by_its_place():
-    with pytest.raises(ValueError, match=re.escape("inner.rate=-1 must be greater than 0.")):
-        read_options(Example, {"inner": {"rate": -1}})
-
-
-def test_every_option_of_its_type_is_accepted():
-    given = {"law": "mlp", "other": "cubic", "laws": ("cubic", "affine"), "count": 2, "most": 3, "rate": 1}
-    example = Example(**given, deadline=2.0, limits=(0.0, -1e300), widths=[4], free="", file="a")
-    assert {name: getattr(example, name) for name in given} == given
-    assert example.file == Path("a") and example.widths == (4,) and Example().deadline == math.inf
-    assert read_options(Example, json.loads(json.dumps(dataclasses.asdict(example), default=str))) == example
-
-
 def test_a_class_that_checks_none_of_its_options_is_refused():
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Unchecked(RunConfig):
@@ -270,47 +224,10 @@ def test_a_class_that_checks_none_of_its_options_is_refused():
         Unchecked()
 
 
-def test_the_choices_of_a_literal_are_known():
-    assert choices(Example, "law") == ("affine", "cubic", "mlp")
-    assert choices(Example, "free") == choices(Example, "widths") == ()
-
-
 @pytest.mark.parametrize("name", [name for name in dir(rt_torchrl) if name.endswith("Config")])
 def test_every_public_configuration_checks_its_options(name):
     with pytest.raises(ValueError, match=f"{name} has no option colour"):
         getattr(rt_torchrl, name)(colour="red")
-
-
-CONFIGS = {
-    DescentConfig: {"optimiser": "newton", "rate": math.inf, "gradient_limit": math.nan},
-    EstimationConfig: {"errors": "newton", "prior": math.inf, "rounds": math.nan, "iterations": math.nan},
-    ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
-    AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
-    RefereeConfig: {"patience": math.nan, "clone_patience": math.inf},
-    PlannerConfig: {"iterations": math.nan, "realisations": 2.5},
-    LearnerConfig: {
-        "actor_rate": math.inf,
-        "batch_size": math.nan,
-        "reward_scale": math.inf,
-    },
-    ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
-    SafetyConfig: {"interval": "0.5"},
-    partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan},
-    TwinningConfig: {"arm": "modelfree", "records": math.nan, "realisations": math.inf, "virtual_episodes": 2.5},
-}
-
-
-@pytest.mark.parametrize(
-    ("config", "option", "value"),
-    [(config, option, value) for config, options in CONFIGS.items() for option, value in options.items()],
-)
-def test_every_configuration_checks_its_options(config, option, value, unchecked):
-    with pytest.raises(ValueError, match=re.escape(f"{option}={value!r} ")):
-        config(**{option: value})
-
-
-def test_a_gradient_may_be_without_a_limit():
-    assert DescentConfig(gradient_limit=math.inf).gradient_limit == math.inf
 
 
 # What a recipe's command line tells in one line instead of a traceback.
@@ -359,15 +276,6 @@ def test_what_the_user_can_mend_is_told_in_a_line(main, message):
 def test_another_error_keeps_its_traceback(main, kind):
     with pytest.raises(kind):
         main_of(Config, main)
-
-
-def test_a_checkout_behind_a_link_tells_in_a_line_too(tmp_path, monkeypatch):
-    (tmp_path / "checkout").mkdir()
-    (tmp_path / "checkout" / "part.py").write_text("def main(config):\n    raise ValueError('mend it')\n")
-    (tmp_path / "link").symlink_to(tmp_path / "checkout")
-    monkeypatch.setattr("rt_torchrl.runs.command_line.OURS", (tmp_path / "checkout",))
-    with pytest.raises(SystemExit, match="error: mend it"):
-        main_of(Config, runpy.run_path(str(tmp_path / "link" / "part.py"))["main"])
 
 
 def test_an_interrupt_leaves_as_shells_report_it():

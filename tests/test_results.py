@@ -4,9 +4,6 @@ import dataclasses
 import json
 import math
 import re
-import subprocess
-import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -28,7 +25,6 @@ from rt_torchrl.runs.results import closure_lines, fit_lines, next_steps, result
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
-from rt_torchrl.steps.imitation import of_each_role
 
 
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
@@ -64,23 +60,6 @@ def test_the_better_policy_is_chosen_on_other_episodes_than_it_is_reported_on():
 
 def cheapest(policies, episodes):
     return min(policies, key=lambda role: stepped_cost(episodes, policies[role]))
-
-
-def test_clones_are_flown_once_and_other_policies_each():
-    """Policies that start with the same weights, or that end as clones, share their flights, with the same numbers."""
-    first, second, other = LinearGain([-0.8, -1.1]), LinearGain([-0.8, -1.1]), LinearGain([-0.8, -1.2])
-    unseen, flown = UnseenEpisodes(LinearQuadratic(horizon=2.0), 3), []
-
-    def costs(policy):
-        flown.append(policy)
-        return unseen.control_costs(policy)
-
-    shared = of_each_role({"model_based": first, "model_free": second}, costs)
-    assert flown == [first] and torch.equal(shared["model_free"], unseen.control_costs(second))
-    flown.clear()
-    each = of_each_role({"model_based": first, "model_free": other}, costs)
-    assert flown == [first, other] and torch.equal(each["model_free"], unseen.control_costs(other))
-    assert not torch.equal(each["model_free"], each["model_based"])
 
 
 # The closure's weights on the terminal.
@@ -262,22 +241,3 @@ def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
     )
     with pytest.raises(ValueError, match=message):
         read_metrics(tmp_path)
-
-
-RULER = Path(__file__).parent / "ruler.py"
-
-
-def ruled(folder, model_based, model_free, paid):
-    folder.mkdir(parents=True)
-    unseen = {"J_a_model_based": {"mean": model_based}, "J_a_model_free": {"mean": model_free}}
-    metrics = {"summary": {"live": "model_free", "unseen": unseen}, "episodes": [{"real_cost": cost} for cost in paid]}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    (folder / "seconds.json").write_text("12.0")
-
-
-def test_a_row_has_ranges_and_counts_trainings_whose_dearer_policy_is_live(tmp_path):
-    ruled(tmp_path / "turbine-pitch" / "0", 1.0, 1.25, [2.0, 3.0])
-    ruled(tmp_path / "turbine-pitch" / "1", 1.5, 1.5, [4.0, 4.0])
-    command = [sys.executable, str(RULER), "--seeds", "2", "--folder", str(tmp_path), "--rows", "turbine, pitch"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "| turbine, pitch | 2 | 1.25 … 1.5 | 1 … 1.5 | 1 | 5 … 8 | 12 |"

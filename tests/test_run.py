@@ -16,7 +16,6 @@ from test_hypotheses import LAG, Suspecting
 from torchrl.collectors import Collector
 
 from rt_torchrl import PlantContractError
-from rt_torchrl.evaluation.unseen import mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
@@ -200,20 +199,14 @@ def test_an_unwritable_folder_is_refused(tmp_path):
     ("options", "message"),
     [
         ({"episodes": 0}, "episodes=0"),
-        ({"episodes": 2.5}, "episodes=2.5 must be a whole number"),
-        ({"unseen": 1}, "unseen=1"),
-        ({"threads": -1}, "threads=-1"),
         ({"resume": True}, "resume needs log_dir"),
-        ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"seed": 2**63}, "seed=9223372036854775808 must be at most 9223372036854775806"),
         ({"hidden": (8, 0)}, r"hidden\[1\]=0 must be at least 1"),
         ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
-        ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
         (
             {"engine": "fast"},
             "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd",
         ),
-        ({"noise": -0.1}, "noise=-0.1 must be at least 0"),
         ({"noise": math.inf}, "noise=inf must be a finite number"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
@@ -237,19 +230,6 @@ def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
 def test_an_unknown_device_is_refused(tmp_path):
     with pytest.raises(ValueError, match="device='nowhere' cannot be used"):
         small_run(tmp_path, device="nowhere")
-
-
-def test_the_confidence_interval_covers_the_mean_as_often_as_it_says():
-    generator = torch.Generator().manual_seed(0)
-    covered = 0
-    for _ in range(200):
-        low, high = mean_with_confidence(torch.randn(40, generator=generator, dtype=torch.float64))[
-            "confidence_interval"
-        ]
-        covered += low <= 0.0 <= high
-    # 95 % nominal; a percentile bootstrap of 40 samples covers about 94 %. 200 trials have a deviation of 1.6 %, so
-    # 89 % is three of them below.
-    assert covered / 200 >= 0.89
 
 
 def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
