@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl import Engine, Plant, Rollout, SaturatedMLP, Scenario, configuration, main_of, shipped_plants
-from rt_torchrl.atomic_file import make_folder, write_results
+from rt_torchrl.atomic_file import make_folder, write_json
 from rt_torchrl.options import AtLeastOne, File, Positive
 from rt_torchrl.trajectories.rollout import refusal
 
@@ -242,7 +242,7 @@ def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
     from rt_torchrl.figures.style import caption, legend_below, panels  # here, because --help need not wait for it
 
     content = {"command": sys.argv, "threads": config.threads, "rows": [row._asdict() for row in rows]}
-    write_results(folder / "benchmark.json", content)
+    write_json(folder / "benchmark.json", content)
     clock, batch = "CPU" if config.threads == 1 else "wall", config.realisations[0]
     for plant in config.plants:
         title = f"{plant}, {config.policy} policy, threads: {config.threads}\n{clock} time [s]"

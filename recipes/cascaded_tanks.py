@@ -25,7 +25,7 @@ from rt_torchrl import (
     main_of,
     sensors_of,
 )
-from rt_torchrl.atomic_file import make_folder, write_results
+from rt_torchrl.atomic_file import make_folder, write_json
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
@@ -175,7 +175,7 @@ def main(config: Config) -> None:
             figure = level_figure(record, readings, f"{name}, {which} record")
             save_figure(figure, config.log_dir / f"{which}_{name.split()[-1]}.png")
         print("\n".join(f"  note on {name}: {warning}" for warning in uncertainty.warnings()))
-    write_results(config.log_dir / "results.json", results)
+    write_json(config.log_dir / "results.json", results)
     print(f"results in {config.log_dir}")
 
 

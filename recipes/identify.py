@@ -14,7 +14,7 @@ import torch
 import tyro
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, configuration, main_of, read_log
-from rt_torchrl.atomic_file import finite, make_folder, new_folder, write_results
+from rt_torchrl.atomic_file import finite, make_folder, new_folder, write_json
 from rt_torchrl.fit.least_squares import Identified, identify
 from rt_torchrl.fit.log import Column, checked, pandas
 from rt_torchrl.fit.resampling import (
@@ -156,7 +156,7 @@ def main(config: Config) -> None:
     for side, segments in zip(("training", "held_out"), split, strict=True):
         metrics[side]["seconds"] = plant.dt * sum(len(segment.actions) for segment in segments)
     metrics["held_back"] = held_back(plant, parts.segments)
-    write_results(folder / "metrics.json", metrics)
+    write_json(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     drawn = {
         "twin_and_log": charts.twin_and_sensors(found),

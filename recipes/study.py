@@ -24,7 +24,7 @@ if __name__ == "__main__":
 import torch
 
 from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
-from rt_torchrl.atomic_file import make_folder, read_json, write_atomically, write_results
+from rt_torchrl.atomic_file import make_folder, read_json, write_atomically, write_json
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.interruption import Interrupted, termination_as_interrupt
@@ -274,7 +274,7 @@ class Search:
         best = exact_optimum(episodes, functools.partial(config.make_policy, physics), **self.effort)
         found = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         self.place.mkdir(parents=True, exist_ok=True)
-        write_results(self.path, {"of": self.of(), **found})
+        write_json(self.path, {"of": self.of(), **found})
 
 
 def known(path: Path) -> dict[str, Any] | None:
@@ -384,7 +384,7 @@ def write(config: Config, comparisons: Sequence[Comparison]) -> str:
     text = "\n\n".join(parts) + "\n"
     write_atomically(config.log_dir / "study.md", text.encode())
     systems = {comparison.title: comparison.numbers() for comparison in comparisons}
-    write_results(config.log_dir / "study.json", {"config": config, "systems": systems})
+    write_json(config.log_dir / "study.json", {"config": config, "systems": systems})
     figure = comparison_figure(comparisons, "$J_a$ of the live policy; line: median of the seeds, band: their range")
     save_figure(figure, config.log_dir / "study.png")
     return text

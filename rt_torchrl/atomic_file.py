@@ -72,14 +72,14 @@ def remove_partials(folder: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write standard JSON, which has no NaN and no infinity; :func:`finite` replaces them.
+def write_json(path: Path, content: Any) -> Path:
+    """Write standard JSON of what :func:`finite` makes of a content, and return the path.
 
     Raises:
-        ValueError: if a number is not finite.
         OSError: if the file cannot be written, see :func:`write_atomically`.
     """
-    write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(path, (json.dumps(finite(content), indent=2, allow_nan=False) + "\n").encode())
+    return path
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -147,13 +147,3 @@ def new_folder(parent: Path, ending: str = "") -> Path:
             number += 1
         else:
             return folder
-
-
-def write_results(path: Path, content: dict[str, Any]) -> Path:
-    """Write what :func:`finite` makes of results, and return the path.
-
-    Raises:
-        OSError: if the file cannot be written; its old content stays.
-    """
-    write_json(path, finite(content))
-    return path

@@ -166,24 +166,34 @@ def require_number(name: str, value: Any, *, whole: bool = False, finite: bool =
         raise ValueError(f"{name}={value} must be {'a finite number' if finite else 'a number or infinite'}.")
 
 
-OTHER_UNITS = {
-    "-": "16 % is 0.16",
-    "s": "1 ms is 0.001 s, 1 h is 3600 s",
-    "m": "1 mm is 0.001 m",
-    "m³": "1 L is 0.001 m³",
-    "m/s": "1 km/h is 0.278 m/s",
-    "kg": "1 g is 0.001 kg",
-    "K": "0 °C is 273.15 K, 1 mK is 0.001 K",
-    "Pa": "1 kPa is 1000 Pa",
-    "W": "1 kW is 1000 W, 1 mW is 0.001 W",
-    "N m": "1 kN m is 1000 N m",
-    "N m/s": "1 kN m/s is 1000 N m/s",
-    "rad": "1 deg is 0.0175 rad",
-    "deg": "1 rad is 57.3 deg",
-    "rad/s": "1 rpm is 0.105 rad/s, 1 deg/s is 0.0175 rad/s",
-    "deg/s": "1 rad/s is 57.3 deg/s",
+OTHER_UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
+    "rad": (("deg", math.pi / 180.0, 0.0),),
+    "rad/s": (("deg/s", math.pi / 180.0, 0.0), ("rpm", math.pi / 30.0, 0.0)),
+    "deg": (("rad", 180.0 / math.pi, 0.0),),
+    "deg/s": (("rad/s", 180.0 / math.pi, 0.0),),
+    "K": (("°C", 1.0, 273.15), ("°F", 5.0 / 9.0, 459.67 * 5.0 / 9.0)),
+    "°C": (("K", 1.0, -273.15), ("°F", 5.0 / 9.0, -32.0 * 5.0 / 9.0)),
+    "Pa": (("kPa", 1e3, 0.0), ("bar", 1e5, 0.0)),
+    "s": (("ms", 1e-3, 0.0), ("h", 3600.0, 0.0)),
+    "m": (("cm", 1e-2, 0.0), ("mm", 1e-3, 0.0)),
+    "m/s": (("km/h", 1.0 / 3.6, 0.0),),
+    "m³": (("L", 1e-3, 0.0),),
+    "kg": (("g", 1e-3, 0.0),),
+    "W": (("kW", 1e3, 0.0), ("mW", 1e-3, 0.0)),
+    "N": (("kN", 1e3, 0.0),),
+    "N m": (("kN m", 1e3, 0.0),),
+    "N m/s": (("kN m/s", 1e3, 0.0),),
+    "-": (("%", 1e-2, 0.0),),
 }
-"""For a unit, what others are in it."""
+"""For a unit, others in which a value may come, with their size in it and their zero."""
+
+
+def other_units(unit: str) -> str:
+    """What other units are in a unit, in words; empty where none is known."""
+    return ", ".join(
+        f"0 {name} is {zero:.5g} {unit}" if zero else f"1 {name} is {float(f'{size:.3g}'):g} {unit}"
+        for name, size, zero in OTHER_UNITS.get(unit, ())
+    )
 
 
 def require_range(name: str, value: float, least: float, greatest: float, *, unit: str, of: str) -> None:
@@ -202,9 +212,10 @@ def require_range(name: str, value: float, least: float, greatest: float, *, uni
     """
     require_number(name, value, finite=False)
     if not least <= value <= greatest:
+        words = other_units(unit)
         raise ValueError(
             f"{name}={value:g} {unit} of {of} must lie in {least:g} to {greatest:g} {unit}; check its unit"
-            f"{f': {OTHER_UNITS[unit]}' if unit in OTHER_UNITS else ''}."
+            f"{f': {words}' if words else ''}."
         )
 
 

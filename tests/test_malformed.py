@@ -395,7 +395,7 @@ RECORD = WindRecord(time=np.arange(3.0), speed=np.full(3, 8.0), source="a test")
 # The constructor with the value in another unit; the beginning of the message; what the message says of that unit.
 WRONG = {
     "km/h for m/s": (lambda: KaimalWind(mean=150.0), "mean=150 m/s of KaimalWind", "1 km/h is 0.278 m/s"),
-    "per cent": (lambda: KaimalWind(intensity=16.0), "intensity=16 - of KaimalWind", "16 % is 0.16"),
+    "per cent": (lambda: KaimalWind(intensity=16.0), "intensity=16 - of KaimalWind", "1 % is 0.01"),
     "km for m": (lambda: KaimalWind(length_scale=0.34), "length_scale=0.34 m of KaimalWind", "1 mm is 0.001 m"),
     "mm/s for m/s": (lambda: RecordedWind(records=[RECORD], floor=3000.0), "floor=3000 m/s of RecordedWind", "0.278"),
     "g for kg": (lambda: FlappingWing(mass=3.0), "mass=3 kg of the drone", "1 g is 0.001 kg"),

@@ -191,7 +191,7 @@ def test_quick_is_a_small_run(tmp_path):
 
 def test_an_unwritable_folder_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="log_dir=.*cannot be written"):
+    with pytest.raises(ValueError, match="log_dir=.*cannot be made"):
         small_run(tmp_path / "file" / "run")
 
 

@@ -15,7 +15,7 @@ import torch
 from small_runs import small_run
 from torch import nn
 
-from rt_torchrl.atomic_file import write_json, write_results
+from rt_torchrl.atomic_file import write_json
 from rt_torchrl.options import read_options
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_config import RunConfig
@@ -261,7 +261,7 @@ def test_numbers_that_json_does_not_have_are_null(tmp_path):
         write_json(file, found)
     assert not list(tmp_path.iterdir())
     content = found | {"config": OperationConfig(), "folder": tmp_path}
-    read = json.loads(write_results(file, content).read_text(), parse_constant=pytest.fail)
+    read = json.loads(write_json(file, content).read_text(), parse_constant=pytest.fail)
     config = {"clock": "simulated", "speed": 1.0, "continuous": False}
     assert read == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "config": config, "folder": str(tmp_path)}
 

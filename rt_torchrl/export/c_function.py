@@ -30,8 +30,6 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 
 Function = Callable[..., dict[str, Tensor]]
-EXAMPLES = 3
-"""Number of observations with their actions in the header, to test the function on its target machine."""
 TOLERANCE = 1e-9
 """Greatest difference of a state in C from that in torch, as a share of the greatest size of the state."""
 FLIGHTS, INTERVALS = 20, 20
@@ -42,7 +40,7 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
     """Write a policy as C99: one function ``void <function>(const double *observation, double *action)``.
 
     The function holds weights, normalisation and saturation. It allocates nothing, keeps nothing between calls and
-    needs only ``math.h``. The header describes observations and actions, with units and ranges, and gives examples.
+    needs only ``math.h``. The header describes observations and actions, with units and ranges.
     :func:`export_controller` also writes what makes the observation of measured signals.
 
     The check compiles the file and calls the function. If there is no compiler, a warning says that the check was left
@@ -96,20 +94,7 @@ def _about_policy(policy: nn.Module, plant: Plant, name: str) -> list[str]:
         "",
         f"Observations are made of states and inputs by {kind.__name__}.observe, in {kind.__module__}.",
         "A range of observations is where they usually lie; actions never leave theirs, if the policy saturates.",
-        "",
-        "Examples, to try it on the machine it is meant for:",
-        *_examples(policy, plant),
     ]
-
-
-def _examples(policy: nn.Module, plant: Plant) -> list[str]:
-    def row(values: Tensor) -> str:
-        return ", ".join(f"{value:.9g}" for value in values.tolist())
-
-    printed = [row(observation) for observation in sample_observations(plant.observations, EXAMPLES)]
-    # The actions are those of the rounded observations, so that the printed numbers are what goes in.
-    read = torch.tensor([[float(x) for x in text.split(",")] for text in printed], dtype=torch.float64)
-    return [f"{{{text}}} -> {{{row(action)}}}" for text, action in zip(printed, policy(read), strict=True)]
 
 
 def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str | None = None) -> float | None:

@@ -13,7 +13,7 @@ import filelock
 import numpy as np
 import torch
 
-from rt_torchrl.atomic_file import new_folder, remove_partials, write_atomically
+from rt_torchrl.atomic_file import make_folder, new_folder, remove_partials, write_atomically
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import FILE, require_same, write_settings
 
@@ -271,7 +271,7 @@ class RunFolder:
 
     def __init__(self, config: RunConfig, plant: str):
         self._config, self._plant = config, plant
-        self.path = self._writable()
+        self.path = self._made()
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
         self.hold()
@@ -281,19 +281,10 @@ class RunFolder:
             self.release()
             raise
 
-    def _writable(self) -> Path:
+    def _made(self) -> Path:
         parent = Path("runs") / self._plant
-        path = self._config.log_dir or parent
-        try:
-            if self._config.log_dir is None:
-                path = new_folder(parent, f"-seed-{self._config.seed}")
-            path.mkdir(parents=True, exist_ok=True)
-            probe = path / f".writable-{os.getpid()}"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            raise ValueError(f"log_dir={path} cannot be written ({error}); choose another with --log-dir.") from error
-        return path
+        make_folder("log_dir", self._config.log_dir or parent)
+        return self._config.log_dir or new_folder(parent, f"-seed-{self._config.seed}")
 
     def hold(self) -> None:
         """Keep other trainings out of the folder from now on.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from rt_torchrl.options import OTHER_UNITS, require_number
+from rt_torchrl.options import other_units, require_number
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -309,5 +309,5 @@ def require_interval(env: EnvBase, interval: float) -> None:
     if isinstance(plant, Plant) and not abs(interval - plant.dt) <= 1e-9 * plant.dt:
         raise ValueError(
             f"interval={interval} s must be the control interval of plant {plant.name!r}, {plant.dt:g} s; check its "
-            f"unit: {OTHER_UNITS['s']}."
+            f"unit: {other_units('s')}."
         )

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds, differences
@@ -63,24 +64,7 @@ CORRELATION = 3.0
 STILL, RESOLUTION = 1e-9, 1e-3
 """Movement or error of a state, as a share of its size: below the first it is none, and beyond the second it shows."""
 FACTORS = (1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
-"""Factors that are tried for each state and input, and for all states of a unit together, beside ``UNITS``."""
-UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "rad": (("deg", math.pi / 180.0, 0.0),),
-    "rad/s": (("deg/s", math.pi / 180.0, 0.0), ("rpm", math.pi / 30.0, 0.0)),
-    "deg": (("rad", 180.0 / math.pi, 0.0),),
-    "deg/s": (("rad/s", 180.0 / math.pi, 0.0),),
-    "K": (("°C", 1.0, 273.15), ("°F", 5.0 / 9.0, 459.67 * 5.0 / 9.0)),
-    "°C": (("K", 1.0, -273.15), ("°F", 5.0 / 9.0, -32.0 * 5.0 / 9.0)),
-    "Pa": (("kPa", 1e3, 0.0), ("bar", 1e5, 0.0)),
-    "m": (("cm", 1e-2, 0.0), ("mm", 1e-3, 0.0)),
-    "m/s": (("km/h", 1.0 / 3.6, 0.0),),
-    "m³": (("L", 1e-3, 0.0),),
-    "W": (("kW", 1e3, 0.0),),
-    "N": (("kN", 1e3, 0.0),),
-    "N m": (("kN m", 1e3, 0.0),),
-    "-": (("%", 1e-2, 0.0),),
-}
-"""For a unit of a plant, others in which a value may come, with their size in it and their zero."""
+"""Factors that are tried for each state and input, and for all states of a unit together, beside ``OTHER_UNITS``."""
 LEVELS, LASTING = 5, 1e-3
 """Number of constant actions over the range of each that are tried, and the share of the horizon that noise must last.
 
@@ -492,7 +476,7 @@ def _signal_mistakes(
 
 def _units(unit: str, factors: Sequence[float]) -> Iterator[tuple[str, float, float]]:
     """In which other unit, or how many times too large, a value may come: words, size and zero."""
-    others = UNITS.get(unit, ())
+    others = OTHER_UNITS.get(unit, ())
     for other, scale, offset in others:
         yield f"in {other}, where the plant has {unit}", scale, offset
     for factor in factors:
