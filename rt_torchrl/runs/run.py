@@ -387,4 +387,3 @@ class Run:
         snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
         drawn = {**figures.figures_of(snapshot), **self.plant_figures(snapshot), **others}
         return {name: figures.pixels(figure) for name, figure in drawn.items()}
-
