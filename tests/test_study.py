@@ -186,7 +186,7 @@ def test_the_figure_has_medians_ranges_and_the_ends_of_its_panels(tmp_path):
     assert drawn == {"a": [4.0, 1.5], "optimum": [0.9, 0.9], "PI": [2.0, 2.0]}
     band = ax.collections[0].get_paths()[0].vertices[:, 1]
     assert band.max() == 1e3 and band.min() == 1.0
-    assert ax.get_ylim()[1] == pytest.approx(4.2) and ax.get_title(loc="right") == "up to 4.2"
+    assert ax.get_title(loc="left") == "tanks: $J_a$"
 
 
 # The study itself.

@@ -23,9 +23,9 @@ Module = TypeVar("Module", bound=nn.Module)
 def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED) -> Float[Tensor, "{count} n_o"]:
     """Random observations, the first of which is as near to zero as the ranges allow.
 
-    A signal with two bounds is uniform over its range. A signal without bounds is normal with a deviation drawn from
-    0.1 ... 30; with one bound, the absolute value of such a number is added to the bound or subtracted from it.
-    Observations are scaled to order one, so that these numbers reach the middle of a policy and its saturated ends.
+    A signal with two bounds is uniform over its range. Another one is normal with a deviation drawn from 0.1 ... 30,
+    and clipped to a bound that it has. Observations are scaled to order one, so that these numbers reach the middle of
+    a policy and its saturated ends.
     """
     generator, columns = torch.Generator().manual_seed(seed), []
     for signal in signals:
@@ -33,10 +33,8 @@ def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED)
         unbounded = torch.randn(count, generator=generator, dtype=torch.float64) * 0.1 * 300.0**exponent
         if math.isfinite(signal.low) and math.isfinite(signal.high):
             column = signal.low + (signal.high - signal.low) * uniform
-        elif math.isfinite(signal.low):
-            column = signal.low + unbounded.abs()
         else:
-            column = signal.high - unbounded.abs() if math.isfinite(signal.high) else unbounded
+            column = unbounded.clamp(signal.low, signal.high)
         column[0] = min(max(0.0, signal.low), signal.high)
         columns.append(column)
     return torch.stack(columns, -1)

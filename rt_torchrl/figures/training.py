@@ -32,10 +32,6 @@ IDENTIFICATION: dict[str, dict[str, Any]] = {
     "J_p_before": {"color": "0.55", "marker": "v", "label": "before assimilation"},
     "J_p": {"color": TWIN, "marker": "o", "label": "after assimilation"},
 }
-EVENTS: dict[str, dict[str, Any]] = {
-    "swap": {"color": "0.35", "linewidth": 1.2, "linestyle": "-", "label": "swap"},
-    "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
-}
 
 
 RESOLUTION = 81
@@ -126,8 +122,7 @@ def learning_curves(snapshot: Snapshot) -> Figure:
     """Costs of control on the real system and on the twin, the twin's error, and the live policy, over the episodes.
 
     The strip at the bottom has a row for each policy, which is filled where the policy was live and pale where it was
-    idle. Vertical lines are swaps and clones; they lie between the episodes because they happen there. A panel is left
-    out if the arm does not report its values.
+    idle. A panel is left out if the arm does not report its values.
     """
     episodes = snapshot.episodes
     shown = [
@@ -149,7 +144,6 @@ def learning_curves(snapshot: Snapshot) -> Figure:
                 ax.plot(np.arange(len(episodes)), column, linewidth=1.4, markersize=4, **look)
         style.logarithmic_if_wide(ax)
         legend_above(ax)
-        _draw_events(ax, episodes)
         caption(ax, name)
     _draw_timeline(strip, episodes, snapshot.live)
     return figure
@@ -216,16 +210,6 @@ def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
     return np.array([np.nan if value is None else float(value) for value in values])
 
 
-def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:
-    drawn = set()
-    for number, episode in enumerate(episodes):
-        event = episode.get("event")
-        if event in EVENTS:
-            line = ax.axvline(number + 0.5, zorder=1, **EVENTS[event])
-            line.set_label(f"_{event}" if event in drawn else event)
-            drawn.add(event)
-
-
 def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None:
     """Draw a row for each policy, filled in the episodes in which it was live and pale in the others."""
     acted = [episode.get("live") or live for episode in episodes]
@@ -233,15 +217,11 @@ def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None
         for is_live, alpha in ((True, 1.0), (False, 0.15)):
             spans = [(k - 0.5, 1.0) for k, actor in enumerate(acted) if (actor == role) == is_live]
             ax.broken_barh(spans, (row - 0.4, 0.8), facecolors=ROLES[role], alpha=alpha, linewidth=0)
-    _draw_events(ax, episodes)
     ax.set_yticks(range(len(ROLES)), [role_name(role) for role in reversed(ROLES)])
     ax.set_ylim(-0.55, len(ROLES) - 0.45)
     ax.grid(False)
     caption(ax, "live (filled) and idle (pale)")
-    legend_above(ax)
-    # An event at the end of the last episode would otherwise lie on the frame.
-    room = 0.25 if episodes[-1].get("event") in EVENTS else 0.0
-    ax.set_xlim(-0.5, len(episodes) - 0.5 + room)
+    ax.set_xlim(-0.5, len(episodes) - 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 

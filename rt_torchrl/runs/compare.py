@@ -24,8 +24,6 @@ ROUNDING = 1e-6
 """Relative difference of a controller's costs on the same episodes that counts as rounding."""
 APART = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
-DEAREST_SHOWN = 10.0
-"""Greatest cost that a panel shows, over the costs of controllers, of the optimum and of the first row at the end."""
 COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
 MARKERS = "os^DvP*X"
 DASHES = ("--", ":", "-.", (0, (1, 1)))
@@ -353,7 +351,6 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
     """J_a of the live policies over the real episodes: a panel for each system, and for each of its tasks.
 
     A line is the median of a row's seeds, its band their range. The optimum and classical controllers are horizontal.
-    Costs above ten times those of controllers, optimum and first row are cut off; a panel says so, and names the rows.
     """
     from matplotlib.ticker import MaxNLocator  # here, because tables need no figure
 
@@ -379,32 +376,18 @@ def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) ->
     """The rows of one task of one system."""
     from rt_torchrl.figures.style import REFERENCE_LINE, caption, logarithmic_if_wide
 
-    known, medians, every = [], {}, []
     for row in rows:
         length, place = min(len(run.curve) for run in row.runs), names.index(row.name)
-        curves = np.array([run.curve[:length] for run in row.runs])
-        number, medians[row.name] = np.arange(1, length + 1), np.median(curves, 0)
+        curves, number = np.array([run.curve[:length] for run in row.runs]), np.arange(1, length + 1)
         look: dict[str, Any] = {"color": COLOURS[place % len(COLOURS)]}
         ax.fill_between(number, curves.min(0), curves.max(0), alpha=0.12, linewidth=0, **look)
         marker = f"{MARKERS[place % len(MARKERS)]}-"
-        ax.plot(number, medians[row.name], marker, markersize=4, label=row.name, **look)
-        every.append(curves.ravel())
+        ax.plot(number, np.median(curves, 0), marker, markersize=4, label=row.name, **look)
     for optimum in {row.optimum for row in rows if row.optimum is not None}:
         ax.axhline(optimum, color="black", linewidth=1.0, label="optimum")
-        known.append(optimum)
     for (name, cost), dash in zip(rows[0].runs[0].controllers.items(), DASHES * len(names), strict=False):
         ax.axhline(cost, label=name, **REFERENCE_LINE | {"linestyle": dash})
-        known.append(cost)
-    known = [cost for cost in (*known, medians[rows[0].name][-1]) if math.isfinite(cost)]
-    shown = np.concatenate([*every, known])
-    top = DEAREST_SHOWN * max(known, default=math.inf)
-    note = ""
-    if top > 0.0 and shown.max() > top:
-        shown = shown[shown <= top]
-        ax.set_ylim(top=1.05 * shown.max())
-        dearer = [name for name, median in medians.items() if median.min() > top]
-        note = f"up to {1.05 * shown.max():.2g}" + (f"; above: {', '.join(dearer)}" if dearer else "")
-    caption(ax, f"{title}: $J_a$", note)
+    caption(ax, f"{title}: $J_a$")
     logarithmic_if_wide(ax)
 
 
