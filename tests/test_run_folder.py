@@ -257,12 +257,9 @@ def test_a_write_that_fails_says_what_is_there_now(old, patch, said, left, tmp_p
 def test_numbers_that_json_does_not_have_are_null(tmp_path):
     """Paths are text then, and dataclasses objects."""
     file, found = tmp_path / "metrics.json", {"a": (float("inf"), 1.0), "b": {"c": float("nan"), "d": "NaN"}}
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(file, found)
-    assert not list(tmp_path.iterdir())
     content = found | {"config": OperationConfig(), "folder": tmp_path}
     read = json.loads(write_json(file, content).read_text(), parse_constant=pytest.fail)
-    config = {"clock": "simulated", "speed": 1.0, "continuous": False}
+    config = {"speed": 1.0, "continuous": False}
     assert read == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "config": config, "folder": str(tmp_path)}
 
 
