@@ -27,7 +27,7 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost, require_rate
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
 
@@ -122,10 +122,6 @@ class Config(RunConfig):
         task: where the drone flies to: paper (5 m forwards and upwards), or hop (1 m forwards and upwards).
         horizon: length of an episode T_o [s].
         peak: height of the window of J_a around the target: unit, or printed as in the paper.
-        energy: weight in J_a of the power of the wings.
-        tilt: weight in J_a of the rate of the stroke plane, in (1000 deg/s)².
-        stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; by default there is none, and the angle may
-            flip within a wing beat.
         model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
         unknown: what the real system has beside its twin, one or more of plane_4.4, plane_6.3, plane_12.6 (slow stroke
             planes), delay, sag, gust, lift_lag, all_1 and all_2; docs/unknown_systems.md describes them.
@@ -139,9 +135,6 @@ class Config(RunConfig):
     horizon: float = 5.0
     observe: tuple[str, ...] = ()
     peak: Literal["unit", "printed"] = "unit"
-    energy: float = 0.0
-    tilt: float = 0.0
-    stroke_plane_rate: float | None = None
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
@@ -150,11 +143,10 @@ class Config(RunConfig):
     def __post_init__(self):
         super().__post_init__()
         FlappingWing.chosen(self.observe)
-        self.cost()
+        TrackingCost(peak=self.peak)
         require_unknown(self.unknown)
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
-        require_rate(self.stroke_plane_rate)
 
     def presets(self) -> dict[Preset, dict[str, Any]]:
         return super().presets() | {
@@ -171,15 +163,10 @@ class Config(RunConfig):
         return FlappingWing(
             horizon=self.horizon,
             target=TARGETS[self.task],
-            cost=self.cost(),
+            cost=TrackingCost(peak=self.peak),
             mass=mass,
-            stroke_plane_rate=self.stroke_plane_rate,
             observe=self.observe or ("paper" if self.preset == "paper" else OBSERVED[self.policy],),
         )
-
-    def cost(self) -> TrackingCost:
-        """The running cost that the options ask for."""
-        return TrackingCost(peak=self.peak, energy=self.energy, rate=self.tilt)
 
     def believed(self) -> FlappingWing | None:
         """The physics of a twin that is wrong about them, or does not know all; None if it is right."""

@@ -242,17 +242,6 @@ def test_noise_and_growth_are_the_most_likely_ones(scatter, apart, explored):
     assert found == (pytest.approx(noise[best[0]], rel=0.03), pytest.approx(growth[best[1]], rel=0.05))
 
 
-def test_a_policy_under_which_the_others_diverge_predicts_worst():
-    """Its own episode is known, so that its correction is no error."""
-    belief = belief_of(LinearQuadratic(horizon=2.0), LinearQuadratic(horizon=2.0), [(0.1 * k, 0.0) for k in range(3)])
-    right = [1.0, 1.0, 1.0]
-    growths = [
-        belief._variances(Told([right, right, last]), belief.flown, [1.0] * 3)[1]
-        for last in ([1.0, 1.0, 1.0], [5.0, 5.0, 1.0], None)
-    ]
-    assert growths[0] < growths[1] <= growths[2]
-
-
 def test_scatter_between_episodes_is_no_distance_of_policies():
     """Each replay of an unread force is exact for any policy; only the force differs between episodes."""
     real, physics = pushed()
@@ -356,17 +345,6 @@ def test_a_belief_that_corrects_nothing_withdraws_what_another_one_said():
     assert twin.expected_costs(policy, *episodes).mean() > 1.1 * twin.episode_costs(policy, *episodes).mean()
     Belief({"model_based": policy}, belief.virtual, corrects=False)
     assert torch.equal(twin.expected_costs(policy, *episodes), twin.episode_costs(policy, *episodes))
-
-
-def test_an_episode_that_explored_says_less():
-    real, physics = pushed()
-    beliefs = [belief_of(real, physics, [(0.5, 0.5)], noise=noise) for noise in (0.0, 0.5)]
-    risks = [
-        belief.correction(policy).item() - belief.anchors().replays.corrections(policy).item()
-        for belief in beliefs
-        for policy in [LinearGain([[0.5, 0.5]])]
-    ]
-    assert risks[0] == pytest.approx(0.5 * NOISE**2) and risks[1] > 2.0 * risks[0]
 
 
 def test_the_latest_whole_episodes_are_replayed_and_again_where_the_twin_has_changed():

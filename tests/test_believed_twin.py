@@ -83,17 +83,6 @@ def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
     assert (alone - flown.states[:, :2]).abs().max() > 1e-3
 
 
-def test_without_a_hypothesis_the_twin_alone_flies_as_before(run):
-    alone = dataclasses.replace(run, twin=DigitalTwin(run.physics, run.closure))
-    policy = run.policy(run.live)
-    flown = alone.simulate(policy, seed=2, on="twin")
-    expected = run.physics.draw_initial_state(1, generator := torch.Generator().manual_seed(2))
-    z = run.physics.draw_exogenous(1, generator)
-    with torch.no_grad():
-        assert torch.equal(flown.states, alone.twin.control(policy, expected, z).states[0])
-    assert alone.twin.hypothesis is None and alone.twin.believed_law is run.closure
-
-
 def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
     summary = run.metrics["summary"]
     assert summary["believed"] == "lags"

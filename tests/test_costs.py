@@ -7,9 +7,9 @@ import torch
 from seeds_and_numbers import double, seeded
 from tensordict.nn import TensorDictModule
 
-from rt_torchrl import PlantEnv, Rollout, check_plant, control_cost
+from rt_torchrl import PlantEnv, Rollout, control_cost
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
+from rt_torchrl.envs.flapping_wing.plant import TrackingCost
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -43,31 +43,6 @@ def test_the_engineering_cost_term_by_term():
     assert turbine_cost(RATED, full, 6.0, still, pitch_rate=1.0) == pytest.approx(4.0, rel=1e-12)
     less = turbine_cost(RATED, full - 15e3, 5.0, still)
     assert turbine_cost(RATED, full - 15e3, 5.0, still, torque_rate=1.0) - less == pytest.approx(4.0, rel=1e-12)
-
-
-def test_the_drone_pays_for_power_and_for_a_stroke_plane_that_turns():
-    plant = FlappingWing(cost=TrackingCost(velocity=0.0, energy=0.5, rate=0.1))
-    assert [state.name for state in plant.states][4:] == ["stroke_plane_angle"]
-    state = double(5.0, 5.0, 0.0, 0.0, 10.0)
-    cost = plant.running_cost(TIME_ZERO, state, double(88.0, 10.5), double(1.0)).item()
-    assert cost == pytest.approx(0.5 * (88.0 / 77.2) ** 3 + 0.1 * 1.0**2, rel=1e-12)  # 0.5 deg in 0.5 ms
-
-
-def test_the_stroke_plane_turns_at_its_greatest_rate():
-    plant, free = (FlappingWing(horizon=0.01, stroke_plane_rate=rate) for rate in (400.0, None))
-    assert len(free.states) == 4 and plant.controller_states == ("stroke_plane_angle",)
-    command = double(70.0, -30.0).expand(1, plant.n_steps, 2)
-    wind = torch.ones(1, plant.n_steps, 1, dtype=torch.float64)
-    flown = Rollout(plant, plant.closure)(plant.draw_initial_state(1, seeded()), wind, command)
-    expected = -0.2 * torch.arange(1, plant.n_steps + 1, dtype=torch.float64)
-    torch.testing.assert_close(flown.actions[0, :, 1], expected)
-    torch.testing.assert_close(flown.states[0, 1:, 4], expected)
-    check_plant(plant, episodes=2, steps=10, traced=False)
-    # Without a limit that is met, the drone is that of the paper.
-    fast = FlappingWing(horizon=0.01, stroke_plane_rate=1e6)
-    same = Rollout(fast, fast.closure)(fast.draw_initial_state(1, seeded()), wind, command)
-    plain = Rollout(free, free.closure)(free.draw_initial_state(1, seeded()), wind, command)
-    torch.testing.assert_close(same.states[..., :4], plain.states, rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", [PaperCost, EngineeringCost, TrackingCost, PressureCost])

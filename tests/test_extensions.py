@@ -138,25 +138,6 @@ def test_a_coefficient_stays_within_its_factor_whatever_the_weight():
         assert own.named_coefficients()["lag"].item() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    "extend",
-    [
-        lambda base: LaggedActuator(base, "force", 1e-7),
-        lambda base: LaggedActuator(base, "force", 1e-7, stages=6),
-        lambda base: LaggedCoefficients(base, 1e-7, (0.0, 0.0)),
-        lambda base: BiasedSensor(base, "position", 0.0, scale=1.0),
-    ],
-)
-def test_an_extension_without_effect_is_the_plant(extend):
-    base = LinearQuadratic()
-    plant = extend(base)
-    state, exogenous, command = flight(plant)
-    expected = Rollout(base, base.closure)(state[:, :2], exogenous, command).states
-    torch.testing.assert_close(
-        Rollout(plant, plant.closure)(state, exogenous, command).states[..., :2], expected, rtol=1e-5, atol=1e-5
-    )
-
-
 def test_the_inflow_of_a_constant_force_rises_exponentially():
     plant = EXTENSIONS["inflow"](LinearQuadratic())
 

@@ -65,7 +65,7 @@ def require_same_weights(found, expected):
 
 CHOICES = {
     "wind_turbine": {"observe": ("preview", "speed_rate"), "task": "engineering", "horizon": 10.0},
-    "flapping_wing": {"observe": ("phase",), "stroke_plane_rate": 3000.0, "energy": 0.1, "horizon": 0.05},
+    "flapping_wing": {"observe": ("phase",), "peak": "printed", "horizon": 0.05},
     "cryogenic_tank": {"observe": ("measured+load",), "command": "duty", "end_weight": 7200.0, "horizon": 3000.0},
 }
 

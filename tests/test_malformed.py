@@ -384,9 +384,6 @@ def test_a_file_of_tensors_that_would_grow_is_refused(tmp_path, compressed):
 # Arguments in a wrong unit, where the physical range is known: refused by name, value, range and what to do.
 
 
-TURN = 180.0 / math.pi
-
-
 def limits(plant, **given):
     return lambda: OperatingLimits(plant(), OperatingLimitsConfig(**given))
 
@@ -400,11 +397,6 @@ WRONG = {
     "mm/s for m/s": (lambda: RecordedWind(records=[RECORD], floor=3000.0), "floor=3000 m/s of RecordedWind", "0.278"),
     "g for kg": (lambda: FlappingWing(mass=3.0), "mass=3 kg of the drone", "1 g is 0.001 kg"),
     "mm for m": (lambda: FlappingWing(target=(5000.0, 5000.0)), "target=5000 m of the drone", "1 mm is 0.001 m"),
-    "rad/s of the stroke plane": (
-        lambda: FlappingWing(stroke_plane_rate=1000.0 / TURN),
-        "stroke_plane_rate=17.4533 deg/s of the drone",
-        "1 rad/s is 57.3 deg/s",
-    ),
     "ms for s": (lambda: FlappingWing(dt=0.5, horizon=5.0), "dt=0.5 s does not resolve", "dt <= 0.0025 s"),
     "s for ms": (lambda: GaussianGust(time_scale=1e4), "time_scale=10000 s of GaussianGust", "1 ms is 0.001 s"),
     "gusts in km/h": (lambda: GaussianGust(mean=36.0), "mean=36 m/s of GaussianGust", "1 km/h is 0.278 m/s"),
@@ -458,5 +450,5 @@ def test_an_argument_in_a_wrong_unit_is_refused(case):
 
 
 def test_what_is_right_is_taken():
-    FlappingWing(mass=3.5e-3, stroke_plane_rate=400.0)
+    FlappingWing(mass=3.5e-3)
     limits(Pendulum, states={"angle": (-math.pi / 2, math.inf)}, rates={"torque": 40.0})()

@@ -70,8 +70,8 @@ def test_the_phase_of_the_wing_beat():
 
 def test_a_filter_of_the_position_tells_the_speed_behind_it():
     """Of a ramp, the low-pass lags by 1/ω_F, and its difference from it is the speed: x − x_F → v/ω_F."""
-    plant = FlappingWing(observe=("position",), stroke_plane_rate=3000.0)
-    assert plant.controller_states == ("stroke_plane_angle", "filtered_position", "filtered_height")
+    plant = FlappingWing(observe=("position",))
+    assert plant.controller_states == ("filtered_position", "filtered_height")
     t = plant.dt * torch.arange(401, dtype=torch.float64)
     ramp = {"forward_position": 0.3 * t, "height": 1.0 - 0.2 * t}
     ramp |= {"forward_speed": torch.full_like(t, 0.3), "climb_speed": torch.full_like(t, -0.2)}
@@ -81,7 +81,7 @@ def test_a_filter_of_the_position_tells_the_speed_behind_it():
     torch.testing.assert_close(seen[2:4], double(-0.3, 0.2), rtol=1e-3, atol=0.0)
     torch.testing.assert_close(plant.seen_velocity(states[-1:])[0], -seen[2:4])
     start = plant.controller_start(double(0.3, 1.2, 0.0, 0.0), torch.zeros(1).double())
-    assert start.tolist() == [0.0, 0.3, 1.2]
+    assert start.tolist() == [0.3, 1.2]
 
 
 def test_a_drone_filters_as_its_log_does():

@@ -20,11 +20,9 @@ from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.trajectories.engines.interval import Interval
-from rt_torchrl.trajectories.engines.parallel import as_one_batch
-from rt_torchrl.trajectories.rollout import Rollout, drive_of
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin, jacobians_of
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 RANGES = {"position": (-3.0, 3.0), "velocity": (-3.0, 3.0)}
 FORCE = "unknown force"
@@ -285,23 +283,6 @@ def test_the_tanks_coefficients_stay_within_a_factor_of_two():
     tank = PLANTS[2]
     ratio = disturbed(tank, 20.0)(points(tank)) / tank.make_closure(seeded())(points(tank))
     assert ratio.min() >= 0.5 and ratio.max() <= 2.0 and ratio.max() > 1.5
-
-
-def test_jacobians_by_rows_are_those_by_columns(plant):
-    """Jacobians by reverse mode equal those by forward mode, by states on visited intervals."""
-    _, flown, exogenous = recorded(plant, batch=2)
-    closure = disturbed(plant, 0.3)
-    names = tuple(name for name, _ in closure.named_parameters())
-    interval, drive = Interval(plant, closure, None), drive_of(plant, exogenous, flown.actions)
-    starts, drive = as_one_batch(flown.states[:, :-1].transpose(0, 1), drive)
-    basis = torch.eye(starts.shape[-1], dtype=torch.float64)
-    along = lambda e: torch.func.jvp(lambda s: interval(s, drive), (starts,), (e.expand_as(starts),))[1]  # noqa: E731
-    with torch.no_grad():
-        columns, rows = torch.func.vmap(along, out_dims=-1)(basis), jacobians_of(interval, names, starts, drive)
-    assert rows.shape[-1] == columns.shape[-1] + sum(w.numel() for w in closure.parameters())
-    rows = rows[..., : columns.shape[-1]]
-    # The same derivatives in another order: rounding, relative to the largest of each state.
-    assert ((columns - rows).abs().amax((0, 2)) <= 1e-10 * columns.abs().amax((0, 2)).clamp(min=1e-300)).all()
 
 
 class Corrected(nn.Module):

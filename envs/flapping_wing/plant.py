@@ -30,18 +30,12 @@ WINDOW_WIDTH = 0.71
 """σ of the cost's window h [m]."""
 HOVER_AMPLITUDE = 77.2
 """Flapping amplitude A_0 that carries the weight in calm air [deg]."""
-STROKE_PLANE_RATE = 1000.0
-"""Unit of the rate of the stroke plane in the cost [deg/s]."""
-STROKE_PLANE_RATES = (60.0, 1e9)
-"""Greatest rates of the stroke plane; with the least one it takes a second for its range, and a flight takes five."""
 
 POSITIONS = (Signal(symbol="x", name="forward_position", unit="m"), Signal(symbol="z", name="height", unit="m"))
 SPEEDS = (
     Signal(symbol=r"\dot x", name="forward_speed", unit="m/s"),
     Signal(symbol=r"\dot z", name="climb_speed", unit="m/s"),
 )
-BODY = len(POSITIONS + SPEEDS)
-"""Number of states of the body, which stand before those that its controller remembers."""
 FILTERED = (
     Signal(symbol="x_F", name="filtered_position", unit="m"),
     Signal(symbol="z_F", name="filtered_height", unit="m"),
@@ -72,8 +66,6 @@ def filtered_rate(axis: int, plant: "FlappingWing", t: Tensor, state: Tensor, ex
     return POSITION_FILTER * (state[..., axis - 2] - state[..., axis])
 
 
-STROKE_PLANE = Measurement.of(ACTIONS[1], scale=30.0)
-"""The stroke plane angle that was applied last, of a drone that remembers it."""
 OF_FILTERED = (
     Measurement(symbol=r"\dot e_{x,F}", name="filtered_rate_x", unit="m/s", read=partial(filtered_rate, 0)),
     Measurement(symbol=r"\dot e_{z,F}", name="filtered_rate_z", unit="m/s", read=partial(filtered_rate, 1)),
@@ -87,15 +79,13 @@ PHASE = ("phase_cosine", "phase_sine")
 
 @configuration
 class TrackingCost:
-    r"""The paper's cost of the way to the target, and of what the flight takes.
+    r"""The paper's cost of the way to the target.
 
     .. math::
-        L_a = \tfrac12\big(\|e\|^2 + \alpha_1\|\dot e\circ h\|^2\big) + w_E\Big(\frac{A_\phi}{A_0}\Big)^3
-        + w_\beta\Big(\frac{\dot\beta_w}{1000\,\mathrm{deg/s}}\Big)^2, \qquad
+        L_a = \tfrac12\big(\|e\|^2 + \alpha_1\|\dot e\circ h\|^2\big), \qquad
         h_i = \hat h_i\exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
 
-    with the position error e (paper, eq. drone_eq_rewardCont). The power of wings that beat at one frequency goes with
-    the cube of their amplitude; A_0 = 77.2 deg carries the weight.
+    with the position error e (paper, eq. drone_eq_rewardCont).
 
     Note: the paper prints a peak ĥ of x_f²/2; here it is 1, because its text calls the function unitary.
     ``peak="printed"`` gives the printed peak.
@@ -103,8 +93,6 @@ class TrackingCost:
     Args:
         velocity: weight α1 of the speed near the target.
         peak: height of the Gaussian window h: 1, or the printed x_f²/2.
-        energy: weight w_E of the power of the wings.
-        rate: weight w_β of the rate of the stroke plane; a drone with it remembers the angle that it applied last.
 
     Raises:
         ValueError: if a weight is negative, or the peak is unknown.
@@ -112,19 +100,12 @@ class TrackingCost:
 
     velocity: NotNegative = 1.0
     peak: Literal["unit", "printed"] = "unit"
-    energy: NotNegative = 0.0
-    rate: NotNegative = 0.0
 
     def __call__(self, plant: "FlappingWing", t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         e = plant.target - state[..., :2]
         peak = 1.0 if self.peak == "unit" else 0.5 * plant.target**2
         h = peak * torch.exp(-0.5 * (e / WINDOW_WIDTH) ** 2)
-        cost = 0.5 * ((e**2).sum(-1) + self.velocity * ((state[..., 2:4] * h) ** 2).sum(-1))
-        if self.energy:
-            cost = cost + self.energy * (applied[..., 0] / HOVER_AMPLITUDE) ** 3
-        if self.rate:
-            cost = cost + self.rate * ((applied[..., 1] - state[..., BODY]) / (plant.dt * STROKE_PLANE_RATE)) ** 2
-        return cost
+        return 0.5 * ((e**2).sum(-1) + self.velocity * ((state[..., 2:4] * h) ** 2).sum(-1))
 
 
 class FlappingWing(Plant):
@@ -152,9 +133,9 @@ class FlappingWing(Plant):
     e     error_rate_z         :math:`\dot e_z = -\dot z/v`                       -     about ±5
     ====  ===================  =================================================  ====  =============
 
-    The table shows the paper's observation e; ``observe`` chooses others. A controller may remember the stroke plane
-    angle that it applied last, and low-passed positions, which are further states: a sensor of the position alone tells
-    the speed by a filter, whose difference from the position is the speed behind it,
+    The table shows the paper's observation e; ``observe`` chooses others. A controller may remember low-passed
+    positions, which are further states: a sensor of the position alone tells the speed by a filter, whose difference
+    from the position is the speed behind it,
 
     .. math:: \dot x_F = \omega_F(x - x_F), \qquad \hat{\dot x} = \omega_F(x - x_F)
 
@@ -173,13 +154,11 @@ class FlappingWing(Plant):
         target: position x_f and z_f of the target [m].
         cost: running cost L_a, such as :class:`TrackingCost`; None for the paper's.
         mass: mass m_b of the body [kg].
-        stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; None for none, as in the paper, so that the
-            angle may flip within a wing beat. With it the angle that was applied last is a fifth state.
         observe: names of ``measurements`` and ``observation_sets``; by default the paper's errors. The low-passed
             positions are two more states, the last ones, if one of these needs them.
 
     Raises:
-        ValueError: for a mass, rate or target that a drone of this kind cannot have, an unknown measurement, or a step
+        ValueError: for a mass or target that a drone of this kind cannot have, an unknown measurement, or a step
             that is unstable or does not resolve the wing beat.
     """
 
@@ -210,7 +189,6 @@ class FlappingWing(Plant):
         Measurement.of(HEADWIND, offset=1.0),
         Measurement(symbol=r"\cos 2\pi ft", name="phase_cosine", unit="-", low=-1.0, high=1.0, read=COSINE),
         Measurement(symbol=r"\sin 2\pi ft", name="phase_sine", unit="-", low=-1.0, high=1.0, read=SINE),
-        STROKE_PLANE,
         *OF_FILTERED,
     )
     observation_sets = {
@@ -244,7 +222,6 @@ class FlappingWing(Plant):
         target: tuple[float, float] = (5.0, 5.0),
         cost: RunningCost | None = None,
         mass: float = 3e-3,
-        stroke_plane_rate: float | None = None,
         observe: Sequence[str] = (),
     ):
         polar = QuasiSteadyPolar.true() if closure is None else closure
@@ -252,15 +229,10 @@ class FlappingWing(Plant):
         for coordinate in target:
             require_range("target", coordinate, -1e3, 1e3, unit="m", of="the drone")
         require_range("mass", mass, *MASSES, unit="kg", of="the drone")
-        require_rate(stroke_plane_rate)
         self.wind = GaussianGust() if wind is None else wind
         self.cost = TrackingCost() if cost is None else cost
-        self.stroke_plane_rate, self._greatest_turn = stroke_plane_rate, (stroke_plane_rate or 0.0) * dt
-        charged = isinstance(self.cost, TrackingCost) and self.cost.rate > 0.0
-        turns = stroke_plane_rate or charged or STROKE_PLANE in self.observed
-        filters = any(measurement in OF_FILTERED for measurement in self.observed)
-        self.remembered, self.filtered = 1 if turns else 0, 2 if filters else 0
-        held = (*ACTIONS[1:][: self.remembered], *FILTERED[: self.filtered])
+        held = FILTERED if any(measurement in OF_FILTERED for measurement in self.observed) else ()
+        self.filtered = len(held)
         self.states, self.controller_states = (*POSITIONS, *SPEEDS, *held), tuple(signal.name for signal in held)
         self.register_buffer("target", torch.tensor(target, dtype=torch.float64))
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
@@ -312,9 +284,8 @@ class FlappingWing(Plant):
         # The air comes with −u_∞ along x, so the body moves with ẋ + u_∞ relative to it.
         relative = torch.cat([velocity[..., :1] + exogenous, velocity[..., 1:]], -1)
         force = self.force(t, relative, action, closure)
-        # The angle that was applied last is held, and the filters follow the position, or there are no such states.
-        held = torch.zeros_like(state[..., BODY : BODY + self.remembered])
-        return torch.cat([velocity, (force + self.weight) / self.mass, held, self._filter_rates(state)], -1)
+        # The filters follow the position, or there are no such states.
+        return torch.cat([velocity, (force + self.weight) / self.mass, self._filter_rates(state)], -1)
 
     def force(
         self, t: Time, relative: Float[Tensor, "*batch 2"], action: Action, closure: nn.Module
@@ -371,13 +342,6 @@ class FlappingWing(Plant):
         pressure = self.strip_mass * speed
         return -(pressure * (C_D * U_x + C_L * U_z)).sum(-1), (pressure * (C_L * U_x - C_D * U_z)).sum(-1)
 
-    def actuate(self, state: State, command: Action) -> Action:
-        """The command, in which the stroke plane turns by at most its rate times dt."""
-        if self.stroke_plane_rate is None:
-            return command
-        change = (command[..., 1] - state[..., BODY]).clamp(-self._greatest_turn, self._greatest_turn)
-        return torch.stack([command[..., 0], state[..., BODY] + change], -1)
-
     # What a controller remembers
 
     def _filter_rates(self, state: State) -> Tensor:
@@ -385,23 +349,17 @@ class FlappingWing(Plant):
         count = self.filtered
         return POSITION_FILTER * (state[..., :count] - state[..., state.shape[-1] - count :])
 
-    def latch(self, state: State, applied: Action) -> State:
-        """The end state, with the stroke plane angle that was applied, if there is a state for it."""
-        angle = applied[..., 1:][..., : self.remembered]
-        return torch.cat([state[..., :BODY], angle, state[..., BODY + self.remembered :]], -1)
-
     def seen_velocity(self, state: State) -> Float[Tensor, "*batch 2"]:
         """Speed [m/s] as a controller knows it: by the filters of the position if there are any, or as measured."""
-        return self._filter_rates(state) if self.filtered else state[..., 2:BODY]
+        return self._filter_rates(state) if self.filtered else state[..., 2:4]
 
     def controller_start(self, measured: Float[Tensor, "*batch n_y"], exogenous: Input) -> Float[Tensor, "*batch n_c"]:
-        """The memory of a controller that is switched on: an upright stroke plane, and settled filters."""
-        upright = measured.new_zeros(*measured.shape[:-1], self.remembered)
-        return torch.cat([upright, measured[..., : self.filtered]], -1)
+        """The memory of a controller that is switched on: settled filters."""
+        return measured[..., : self.filtered]
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """All states along a log; what a controller would have remembered follows from the others."""
-        completed = {ACTIONS[1].name: torch.cat([actions[:1, 1], actions[:, 1]])}
+        completed = {}
         for position, signal in zip(POSITIONS, FILTERED[: self.filtered], strict=False):
             if position.name in measured:
                 place = measured[position.name]
@@ -442,7 +400,7 @@ class FlappingWing(Plant):
     # Randomness
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
-        """Initial states at rest in the origin, with an upright stroke plane; nothing is drawn."""
+        """Initial states at rest in the origin; nothing is drawn."""
         return torch.zeros(batch, len(self.states), dtype=torch.float64, device=generator.device)
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 1"]:
@@ -460,13 +418,3 @@ class FlappingWing(Plant):
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The paper's policy: one affine law with offset per action through the smooth clip, ten weights for errors."""
         return SaturatedAffine(len(self.observations), self.actions, weight_scale=0.2, generator=generator)
-
-
-def require_rate(rate: float | None) -> None:
-    """Refuse a greatest rate of the stroke plane [deg/s] that no drone has; None means no limit.
-
-    Raises:
-        ValueError: if the rate is not within ``STROKE_PLANE_RATES``.
-    """
-    if rate is not None:
-        require_range("stroke_plane_rate", rate, *STROKE_PLANE_RATES, unit="deg/s", of="the drone")
