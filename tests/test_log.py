@@ -18,7 +18,7 @@ from rt_torchrl.trajectories.rollout import Rollout
 record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
 
-pytest.importorskip("pandas"), pytest.importorskip("pint")
+pytest.importorskip("pandas")
 PLANT = LinearQuadratic(dt=0.1)
 TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,1,0,b\n250,3000,0.3,-1,0.5,c\n"
 MAPPING = [Column.parse("t=time*0.001"), Column.parse("x_mm=position*1e-3+2")]
@@ -44,7 +44,7 @@ def jittered(n, dt=0.1, seed=0):
         ("T [C]=wall_temperature+273.15", ("T [C]", "wall_temperature", 1.0, 273.15, None)),
         ("p=pressure*1e5-2.5", ("p", "pressure", 1e5, -2.5, None)),
         ("a=b=force*-1e-3+1e2", ("a=b", "force", -1e-3, 1e2, None)),
-        ("T [C]=wall_temperature[degC]", ("T [C]", "wall_temperature", 1.0, 0.0, "degC")),
+        ("T [C]=wall_temperature[°C]", ("T [C]", "wall_temperature", 1.0, 0.0, "°C")),
         ("a=b=flow[m^3/s]", ("a=b", "flow", 1.0, 0.0, "m^3/s")),
     ],
 )
@@ -60,7 +60,9 @@ def test_columns_are_converted_by_their_units(tmp_path):
     assert log.columns["position"].tolist() == pytest.approx([1.0, 2.0, 3.0])
     assert log.columns["velocity"].tolist() == pytest.approx([0.1 / 3.6, 0.2 / 3.6, 0.3 / 3.6])
     assert read_log(tmp_path / "log.csv", PLANT, MAPPING).columns["position"].tolist() == [3.0, 4.0, 5.0]
-    with pytest.raises(ValueError, match=r"column 'x_mm' of .* for signal 'position': 'kg' .* and 'm' .*"):
+    with pytest.raises(
+        ValueError, match=r"column 'x_mm' of .* for signal 'position': unit 'kg' is none of m, cm, mm;"
+    ):
         read_log(tmp_path / "log.csv", PLANT, [columns[0], Column.parse("x_mm=position[kg]")])
 
 
@@ -231,20 +233,16 @@ def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
 @pytest.mark.parametrize(
     ("unit", "signal", "number", "expected"),
     [
+        ("rad/s", "rad/s", 30.0, 30.0),
         ("rpm", "rad/s", 30.0, math.pi),
-        ("turn/s", "rad/s", 1.0, 2.0 * math.pi),
         ("deg", "rad", 180.0, math.pi),
         ("°F", "K", 451.0, (451.0 + 459.67) * 5.0 / 9.0),
-        ("degC", "K", -40.0, 233.15),
-        ("delta_degF", "K", 9.0, 5.0),
+        ("°C", "K", -40.0, 233.15),
         ("kN m", "N m", 1.5, 1500.0),
         ("%", "-", 12.0, 0.12),
         ("L", "m³", 2.0, 2e-3),
-        ("L/min", "m^3/s", 60.0, 1e-3),
-        ("mbar", "Pa", 1013.25, 101325.0),
         ("ms", "s", 250.0, 0.25),
     ],
 )
 def test_units_are_converted(unit, signal, number, expected):
-    # Factors of some digits are multiplied: rounding only.
     assert converted(np.array([number]), unit, signal) == pytest.approx([expected], rel=1e-13)

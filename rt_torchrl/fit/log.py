@@ -4,7 +4,6 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.fit.sensors import known_sensors
-from rt_torchrl.options import Positive, array_of, configuration
+from rt_torchrl.options import OTHER_UNITS, Positive, array_of, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -24,7 +23,6 @@ COLUMN = re.compile(
     rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
     re.DOTALL,
 )
-EXAMPLES = "write it as in rpm, m/s^2, kN m, degC."
 WITH_OFFSET = r"\d[Tt ].*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
 """A date whose time of day says by how much it is ahead of UTC."""
 
@@ -199,7 +197,7 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Sensor
     Raises:
         ValueError: if the file cannot be read, a line has more or fewer entries than the header, a column is missing,
             is there twice, names an unknown signal or is not numeric, the times are not increasing, or the unit of a
-            column measures another quantity than the unit of its signal.
+            column is not known for its signal.
     """
     frame = _read(path)
     headers = list(frame)
@@ -371,40 +369,24 @@ def _entry(series: Any, wrong: Any, what: str) -> str:
 
 
 def converted(values: Rows, unit: str, to: str) -> Rows:
-    """The values in another unit, converted by the library pint.
-
-    To pint an angle is a pure number; here it is not. Hz and rad/s, which differ by 2π, therefore measure different
-    quantities.
+    """The values in another unit.
 
     Args:
         values: numbers in ``unit``.
-        unit: unit of the values, such as ``rpm``, ``kN m``, ``degF`` or ``%``. Temperatures are absolute;
-            ``delta_degF`` is the unit of a difference.
+        unit: unit of the values, such as ``rpm``, ``kPa``, ``°F`` or ``%``: that of the result, or one of
+            ``OTHER_UNITS`` for it.
         to: unit of the result; ``-`` is the unit of a pure number.
 
     Raises:
-        ValueError: if a unit is unknown, the two measure different things, or pint is not installed.
+        ValueError: if it is another unit.
     """
-    registry, pint = _registry()
-    try:
-        have, want = (registry.Unit("" if name.strip() == "-" else name) for name in (unit, to))
-        base, wanted = (str(registry.get_base_units(each)[1]) for each in (have, want))
-        if base == wanted:
-            return registry.Quantity(values, have).to(want).magnitude
-    except pint.UndefinedUnitError as error:
-        raise ValueError(f"unit {unit!r} is not known ({error}); {EXAMPLES}") from error
-    except Exception as error:  # pint's parser lets errors of Python's own parser through
-        raise ValueError(f"unit {unit!r} is not understood; {EXAMPLES}") from error
-    raise ValueError(f"{unit!r} (base units {base}) and {to!r} ({wanted}) do not measure the same quantity.")
-
-
-@cache
-def _registry() -> tuple[Any, Any]:
-    try:
-        import pint
-    except ImportError as error:
-        raise ValueError("units need pint: install the extra, pip install 'rt_torchrl[logs]'.") from error
-    return pint.UnitRegistry(), pint
+    known = {to: (1.0, 0.0)} | {name: (size, zero) for name, size, zero in OTHER_UNITS.get(to, ())}
+    if unit not in known:
+        raise ValueError(
+            f"unit {unit!r} is none of {', '.join(known)}; convert from others by HEADER=SIGNAL*FACTOR+OFFSET."
+        )
+    size, zero = known[unit]
+    return size * values + zero
 
 
 def pandas() -> Any:
