@@ -60,9 +60,7 @@ def test_columns_are_converted_by_their_units(tmp_path):
     assert log.columns["position"].tolist() == pytest.approx([1.0, 2.0, 3.0])
     assert log.columns["velocity"].tolist() == pytest.approx([0.1 / 3.6, 0.2 / 3.6, 0.3 / 3.6])
     assert read_log(tmp_path / "log.csv", PLANT, MAPPING).columns["position"].tolist() == [3.0, 4.0, 5.0]
-    with pytest.raises(
-        ValueError, match=r"column 'x_mm' of .* for signal 'position': unit 'kg' is none of m, cm, mm;"
-    ):
+    with pytest.raises(ValueError, match=r"column 'x_mm' of .* for signal 'position': unit 'kg' is none of m, cm, mm;"):
         read_log(tmp_path / "log.csv", PLANT, [columns[0], Column.parse("x_mm=position[kg]")])
 
 
