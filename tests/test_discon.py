@@ -11,7 +11,6 @@ from c_build import COMPILER, library, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from printed_commands import TEXTS, blocks
 from seeds_and_numbers import seeded
-from test_export_recipe import leave_run, recipe
 
 from rt_torchrl import DISCON, StateFeedback, export_discon, shipped_plants
 from rt_torchrl.contract.check import require_controller
@@ -318,22 +317,3 @@ def test_a_policy_that_needs_more_than_the_swap_array_is_refused(tmp_path):
     with pytest.raises(ValueError, match="must end in .c"):
         export_discon(LinearGain([[1.0]]), tmp_path / "discon.so", preview)
     assert not list(tmp_path.iterdir())
-
-
-@needs_compiler
-def test_the_recipe_writes_a_library(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
-    leave_run(tmp_path, "wind_turbine", policy="scheduled", horizon=5.0)
-    export = recipe("export")
-    given = {"run": tmp_path, "what": ("controller",), "formats": ("discon",), "output": tmp_path / "files"}
-    for options in ({}, {"role": "model_free"}, {"name": "blade"}):
-        export.main(export.Config(**given, **options))
-    names = [f"{name}_discon" for name in ("wind_turbine_model_based", "wind_turbine_model_free", "blade")]
-    files = {path.name for path in (tmp_path / "files").iterdir()}
-    assert files == {file for name in names for file in (f"{name}.c", f"lib{name}.so")}
-    assert "blade_discon.c: within" in capsys.readouterr().out
-    plant = WindTurbine(observe=("scheduled",), horizon=5.0)
-    for name in names:
-        assert DISCON(plant, tmp_path / "files" / f"lib{name}.so").fly(*drawn(plant, 1)).states.isfinite().all()
-    with pytest.raises(ValueError, match="no discon of policy can be written"):
-        export.Config(run=tmp_path, formats=("c", "discon"))

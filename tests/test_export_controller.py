@@ -211,28 +211,6 @@ class Misstarted(Lagged):
         return measured[..., :1]
 
 
-class Turning(Lagged):
-    """The position is an angle, and the filter follows it."""
-
-    states = (
-        Lagged.states[0],
-        Signal(symbol="x", name="position", unit="m", low=-math.pi, high=math.pi, periodic=True),
-        *Lagged.states[2:],
-    )
-
-
-def test_an_angle_goes_the_short_way():
-    """From 3.1 over π to −3.1 is an advance of 2π − 6.2, which the filter df/dt = x − f follows."""
-    controller = Controller(Turning(dt=0.1), LinearGain(GAINS))
-    zero, one = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
-    before, after = (torch.tensor([[x, 0.0]], dtype=torch.float64) for x in (3.1, -3.1))
-    memory = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
-    _, found = controller.advance(zero, memory, before, one, one, after)[0].tolist()
-    rate = (2.0 * math.pi - 6.2) / 0.1
-    exact = 3.1 + 0.1 * rate - rate + (3.0 - 3.1 + rate) * math.exp(-0.1)
-    assert found == pytest.approx(exact, abs=1e-6)
-
-
 REFUSED = {
     "a state that depends on the closure": (Guessed, GAINS, r"integral, filtered_position\) depend on the closure"),
     "a name that is no state": (Misnamed, [[1.0, 1.0]], "names speed_error; its states are position, velocity"),

@@ -200,25 +200,6 @@ def test_power_and_speed_against_their_references(turbine):
     assert units == ["m/s]", "rad/s]", "MW]", "kN m]", "deg]"]
 
 
-def test_power_coefficient_of_true_table_and_twin_side_by_side(turbine):
-    figure = turbine_figures.power_coefficient(turbine)
-    table, law, error = figure.axes[:3]
-    values = [ax.collections[0].get_array().reshape(81, 89) for ax in (table, law, error)]
-    corners = table.collections[0].get_coordinates()
-    ratio, pitch = corners[40, 50]
-    for closure, found in zip((turbine.plant.closure, turbine.closure), values, strict=False):
-        expected = closure(torch.tensor([ratio, pitch], dtype=torch.float64)).item()
-        # A batch may round differently from a single point.
-        assert found[40, 50] == pytest.approx(expected, rel=1e-9)
-    np.testing.assert_allclose(values[2], values[1] - values[0], rtol=0, atol=1e-12)
-    lam = 63.0 * turbine.record.states[:-1, 0] / turbine.record.exogenous[:, 0]
-    visited = torch.stack([lam, turbine.record.actions[:, 1]], -1)
-    true, twin = (closure(visited).squeeze(-1).detach() for closure in (turbine.plant.closure, turbine.closure))
-    for ax in (table, law, error):
-        np.testing.assert_allclose(np.stack(line(ax, "visited").get_data(), -1), visited, rtol=1e-12)
-    assert f"visited: {(twin - true).square().mean().sqrt():.2g}" in figure._suptitle.get_text()
-
-
 def flown(plant, count=1, n=40):
     generator = torch.Generator().manual_seed(3)
     policy = plant.make_policy(generator)
@@ -284,14 +265,3 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
             assert np.array_equal(shown[column].get_ydata(), expected)
             assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
             assert (np.abs(shown[column].get_xdata() - column) < 0.3).all()
-
-
-@pytest.mark.parametrize(("least", "scale"), [(0.001, "log"), (-0.5, "linear")])
-def test_only_positive_costs_have_a_logarithmic_axis(oscillator, least, scale):
-    found = judged("model_based", "model_free", "on-off", "Jonkman")
-    found["Jonkman"].control_costs[0] = least
-    figure = figures.unseen(found)
-    draw(figure)
-    assert not collisions(figure) and figure.axes[0].get_yscale() == scale
-    episodes = [{"real_cost": cost, "J_p": 1.0} for cost in (1.0, least)]
-    assert figures.learning_curves(replace(oscillator, episodes=episodes)).axes[0].get_yscale() == scale

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from figure_reading import draw, line, panel, snapshot_of
+from figure_reading import line, panel, snapshot_of
 
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.snapshot import Snapshot
-
-SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 
 
 @pytest.fixture(scope="module")
@@ -43,27 +41,6 @@ def test_collectors_path_is_the_record(snapshot):
 
 def _side_labels(plant):
     return plant.inputs[0].label, "distance to the target [m]"
-
-
-def test_collectors_is_the_record_and_its_means_over_the_beats(snapshot):
-    figure, plant = figures.flight(snapshot), snapshot.plant
-    for k in (0, 1):
-        ax = panel(figure, plant.states[k].label)
-        assert same(line(ax, "real"), snapshot.record.states[:, k])
-        assert same(line(ax, "twin"), snapshot.replay[:, k])
-        assert line(ax, "target").get_ydata()[0] == 5.0
-    beats = {signal.label: snapshot.record.states[:-1, k] for k, signal in enumerate(plant.states) if k > 1}
-    beats |= {signal.label: snapshot.record.actions[:, k] for k, signal in enumerate(plant.actions)}
-    for label, values in beats.items():
-        ax, by_beat = panel(figure, label), values.reshape(4, SAMPLES_PER_BEAT)
-        # The sums are made in another order.
-        np.testing.assert_allclose(line(ax, "real").get_ydata(), by_beat.mean(1).numpy(), rtol=1e-12, atol=1e-14)
-        band = ax.collections[0].get_paths()[0].vertices[:, 1]
-        assert (band.min(), band.max()) == (values.min().item(), values.max().item())
-    for signal in plant.actions:
-        ends = [entry.get_ydata()[0] for entry in panel(figure, signal.label).lines[1:]]
-        assert ends == [signal.low, signal.high]
-    assert "time [s]" in draw(figure)
 
 
 def test_polars_are_those_of_the_closures(snapshot):

@@ -219,42 +219,6 @@ def test_an_installed_wheel_trains_and_is_read_back_without_further_packages(whe
 # Between a command and its first episode, a recipe loads nothing that this episode does not use.
 
 
-FIRST_EPISODES = """
-import runpy, sys
-from rt_torchrl import atomic_file
-
-write = atomic_file.write_atomically
-
-class Done(BaseException):
-    pass
-
-def until_checkpoint(path, content):
-    if path.match("checkpoint-*.pt"):  # which is written at the end of an episode
-        raise Done
-    write(path, content)
-
-atomic_file.write_atomically = until_checkpoint
-folder, *recipes = sys.argv[1:]
-for path in recipes:
-    sys.argv = [path, "--quick", "--threads", "1", "--log-dir", f"{folder}/{len(path)}"]
-    if "flapping_wing" not in path:  # one learns from a controller, which takes longer than its first episode
-        sys.argv += ["--start", "random"]
-    try:
-        runpy.run_path(path, run_name="__main__")
-    except Done:
-        late = ("matplotlib", "onnx", "jax", "casadi", "gymnasium", "torch._inductor.compile_fx")
-        print("late:", [name for name in late if name in sys.modules], flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_the_first_episodes_load_only_what_they_use(tmp_path):
-    recipes = [str(ROOT / "recipes" / f"{name}.py") for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
-    done = python(FIRST_EPISODES, str(tmp_path), *recipes)
-    said = [line for line in done.stdout.splitlines() if line.startswith("late: ")]
-    assert said == ["late: []"] * 3, done.stdout + done.stderr
-
-
 def test_every_recipe_says_that_it_starts_before_it_loads_pytorch():
     """The import of PyTorch fails here; it comes after the line, or the line would be missing."""
     code = (

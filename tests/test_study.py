@@ -338,24 +338,6 @@ def test_a_cluster_of_ray(tmp_path):
     assert not failures and list(comparison.rows[0].costs) == [0, 1]
 
 
-def test_what_an_optimum_depends_on_has_a_file_of_its_own(tmp_path):
-    def of(words, **options):
-        return config(tmp_path, **options).search(study.Training(TINY, tuple(words.split()), 0, tmp_path))
-
-    plain = of("")
-    assert plain.path == of("--twinning.arm model_free --episodes 7").path
-    others = [of("--horizon 1.0"), of("--unseen 5"), of("", quick=True)]
-    elsewhere = tmp_path / TINY.name
-    elsewhere.write_text(TINY.read_text())
-    others.append(study.Search(elsewhere, (), {}, tmp_path / "optima"))
-    assert len({plain.path, *(other.path for other in others)}) == 5
-    # What policies observe may follow from the preset.
-    turbine = Path(study.__file__).with_name("wind_turbine.py")
-    words = ("--preset paper --policy mlp", "--policy mlp", "--policy mlp --observe paper")
-    made = [study.Search(turbine, tuple(text.split()), {}, tmp_path) for text in words]
-    assert made[0].path == made[2].path != made[1].path
-
-
 def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
     """Model predictive control may cost less than the optimum of the class."""
     twinning = {name: ("--twinning.planner.method", name) for name in ("single_start", "receding_horizon")}

@@ -121,7 +121,7 @@ class Run:
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
-        self.asked, self.config = config, config.effective()
+        self.config = config.effective()
         self.plant_figures = plant_figures
         self.ended: str | None = None
         self.callbacks = callbacks
