@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 NEAR = 0.1
 """Distance from the optimum, as a share of it, within which a policy is near the optimum."""
-ROUNDING = 1e-6
-"""Relative difference of a controller's costs on the same episodes that counts as rounding."""
 APART = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
 COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
@@ -166,7 +164,7 @@ class Comparison:
         rows: rows, whose runs were judged on the same number of unseen episodes of one plant, at one place.
 
     Raises:
-        ValueError: if they were not, a seed occurs twice in a row, or a controller costs differently in one task.
+        ValueError: if they were not, or a seed occurs twice in a row.
     """
 
     def __init__(self, title: str, rows: Sequence[Row]):
@@ -184,20 +182,6 @@ class Comparison:
                 folders = ", ".join(str(run.folder) for run in row.runs if seeds.count(run.seed) > 1)
                 raise ValueError(f"{folders} have the same seed and the same options; give one of them.")
         self.title, self.rows = title, rows
-        self._require_one_plant()
-
-    def _require_one_plant(self) -> None:
-        """Runs in code may have the same options and different plants, on which controllers cost differently."""
-        for group in self.tasks():
-            runs = [run for row in group for run in row.runs if run.place == "simulation"]
-            for name in {name for run in runs for name in run.controllers}:
-                costs = [run.controllers[name] for run in runs if name in run.controllers]
-                if not np.allclose(costs, costs[0], rtol=ROUNDING, equal_nan=True):
-                    shown = ", ".join(f"{cost:.6g}" for cost in costs)
-                    raise ValueError(
-                        f"the runs have the same task, but {name} costs {shown} on their unseen episodes: their plants "
-                        "differ in what no option says. Compare runs of one plant."
-                    )
 
     def tasks(self) -> list[list[Row]]:
         """The rows, those of one task together: costs of different tasks do not compare."""
