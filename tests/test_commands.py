@@ -104,7 +104,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
     known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
-    known |= {"uv run --extra tank tests/ruler.py"}  # an hour
+    known |= {"uv run --extra tank tests/ruler.py", "uv run --extra tank tests/ruler.py --seeds 5"}  # an hour
     known |= {"uv run --group nightly tests/fast_gradients.py"}  # tests/test_benchmark.py
     known |= {"uv run --group nightly tests/learners.py"}  # half an hour
     known |= {
