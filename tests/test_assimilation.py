@@ -12,8 +12,6 @@ from torch import nn
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.fit.least_squares import Estimation
-from rt_torchrl.fit.sensors import sensor_record, state_sensors
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
@@ -76,29 +74,6 @@ def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
         assert J_p == pytest.approx(0.1 * 0.5 * (parts**2).sum(1).mean(), rel=1e-7)
     samples = parts if initial == "estimated" else parts[:, 1:]
     assert fit.report() == {"rms/position [m]": pytest.approx(np.sqrt((samples**2).mean()), rel=1e-6)}
-
-
-class Capped(Slope):
-    """ẋ = min(w_0, 1): above one the weight has no effect."""
-
-    def forward(self, features):
-        return self.w[:1].clamp(max=1.0).expand_as(features)
-
-
-def test_the_error_of_a_first_sample_does_not_leave_a_weight_where_it_shows_nowhere():
-    """With the first sample, two metres too low, the best slope is above the cap, from where no gradient leads back."""
-    values = 0.9 * 0.1 * np.arange(101) + 0.01 * noise_of(101, 0)
-    values[0] -= 2.0
-    plant, fixed, closure = Line(), Capped(), Capped()
-    sensors = state_sensors(plant)
-    records = [sensor_record(plant, sensors, line_segment(values))]
-    Estimation(DigitalTwin(plant, fixed), sensors, spread=torch.zeros(1).double()).run(records)
-    assert fixed.w[0] > 1.0
-    Estimation(DigitalTwin(plant, closure), sensors).run(records)
-    # The regression holds the wrong sample too: two metres at the end of ten seconds weigh 0.01 m/s or so.
-    times = 0.1 * np.arange(101)
-    assert closure.w[0].item() == pytest.approx(np.polyfit(times, values, 1)[0], abs=1e-4)
-    assert abs(closure.w[0].item() - 0.9) < 0.02
 
 
 @pytest.mark.parametrize("closure", ["paper", "mlp"])

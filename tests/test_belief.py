@@ -205,18 +205,6 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
     assert reports[1]["alarm"].item() == 1.0 and not any(flights[-5:])
 
 
-def test_two_identical_policies_never_change_roles():
-    found = twinning(exploration=QUIET)
-    live, idle = found.referee.live, found.referee.idle
-    found.policies[idle].load_state_dict(found.policies[live].state_dict())
-    report_costs(found, 2.0)
-    changes = {"weight_changes": {role: torch.ones(()) for role in found.policies}}
-    episode = found.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", live)).update(changes)
-    found.module["inputs"](episode)
-    for _ in range(4):
-        assert found.module["switch"](episode)["event"] != "swap" and found.referee.live == live
-
-
 def test_the_cheaper_policy_acts():
     referee = ExpectedCost(RefereeConfig(clone_patience=0), "model_free")
 
@@ -341,13 +329,3 @@ def test_swap_and_clone_need_more_than_their_patience(patience):
     for costs, event in ((WORSE, "swap"), (BETTER, "clone")):
         events = [e for e, *_ in play(config, [(costs, STALLED)] * (2 * patience + 2))[0]]
         assert events == (["keep"] * patience + [event]) * 2
-
-
-@pytest.mark.parametrize("live, other", [("model_free", "model_based"), ("model_based", "model_free")])
-def test_roles_exchange_and_only_by_a_swap(live, other):
-    referee = play(RefereeConfig(), [(WORSE, MOVING)] * 2, live)[1]
-    assert (referee.live, referee.idle) == (live, other)
-    referee.decide(evidence(*WORSE, MOVING))
-    assert (referee.live, referee.idle) == (other, live)
-    referee = play(RefereeConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
-    assert (referee.live, referee.idle) == (live, other)

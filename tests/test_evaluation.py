@@ -20,7 +20,6 @@ from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 from rt_torchrl.plants.actuators import StickingActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import StateBounds
-from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.rollout import ENGINES
@@ -76,21 +75,6 @@ def test_the_reference_of_a_plant_with_stiction_is_that_of_a_grid_and_not_of_gra
     best = min(unseen.control_costs(LinearGain([list(map(float, gains))])).mean().item() for gains in grid)
     assert found.cost == unseen.control_costs(found.policy).mean().item() <= 1.01 * best
     assert found.cost < 0.99 * found.by_gradients
-
-
-def test_the_effort_of_the_reference_follows_the_number_of_weights():
-    """Whatever a recipe calls it, a perceptron takes more gradients than a gain."""
-    unseen = UnseenEpisodes(LinearQuadratic(horizon=0.4), 2)
-
-    def small_perceptron(generator):
-        return SaturatedMLP(2, unseen.plant.actions, hidden=(6,), generator=generator)
-
-    for make_policy, numbers in (
-        (random_gain, {"approach": 0, "iterations": 80, "polish": 20}),
-        (small_perceptron, {"approach": 600, "iterations": 300, "polish": 150}),
-    ):
-        given = exact_optimum(unseen, make_policy, starts=1, few=2, **numbers)
-        assert exact_optimum(unseen, make_policy, starts=1, few=2)[2:] == given[2:]
 
 
 class OnlyReal(RealController):
@@ -203,18 +187,3 @@ def test_an_engine_whose_gradient_is_another_one_trains_nothing(engine, tmp_path
     with pytest.raises(ValueError, match=said):
         run.train()
     assert not run.episodes
-
-
-@pytest.mark.parametrize("engine, most", [("native", 1e-13), ("parallel", 1e-13), ("odeint_adjoint", 1e-4)])
-def test_the_gap_of_the_engine_that_trains_has_its_name(engine, most, tmp_path, monkeypatch):
-    gaps, scalar = {}, Dashboard.scalar
-
-    def seen(dashboard, tag, *numbers):
-        if "gap" in tag:
-            gaps[tag] = numbers
-        scalar(dashboard, tag, *numbers)
-
-    monkeypatch.setattr(Dashboard, "scalar", seen)
-    run = small_run(tmp_path, episodes=1, engine=engine)
-    gap = run.train()["summary"]["engine_gap"]
-    assert gaps == {f"gradient/relative gap of {engine} to autograd, short horizon": (gap,)} and gap < most

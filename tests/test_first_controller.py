@@ -5,12 +5,11 @@ import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from test_algorithm import twinning
-from test_classical import PD, episodes
+from test_classical import PD
 
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.start import FirstController
-from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 GAINS = (0.4, 0.3)
 
@@ -22,19 +21,6 @@ def begun(*, gains=GAINS, **options):
     parts = {"planner": PlannerConfig(iterations=0), "assimilation": AssimilationConfig(iterations=3)}
     counts = {"realisations": 4, "virtual_episodes": 4}
     return twinning(seed=1, first=first, learner=learner, **counts, **parts | options)
-
-
-def test_it_acts_as_it_flies():
-    plant = LinearQuadratic(horizon=1.0)
-    law = PD(plant, GAINS)
-    acting, (state, exogenous) = law, episodes(plant)
-    flown = law.fly(state, exogenous)
-    assert isinstance(acting, StateFeedback)
-    for _ in range(2):
-        acting.begin()
-        commands = [acting.act(k * plant.dt, flown.states[:, k], exogenous[:, k]) for k in range(plant.n_steps)]
-        torch.testing.assert_close(torch.stack(commands, 1), flown.actions, rtol=1e-13, atol=1e-13)
-        assert acting._memory.unique().tolist() == [plant.n_steps]
 
 
 def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
@@ -103,12 +89,3 @@ def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
     with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
         small_run(tmp_path / "run", start="controller")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_run_that_was_killed_in_its_first_episode_begins_with_the_controller_again(tmp_path):
-    killed = run(tmp_path, start="controller")
-    killed._held.begin(killed.config)
-    killed._held.release()
-    again = run(tmp_path, start="controller", resume=True)
-    assert isinstance(again.algorithm.first, FirstController)
-    again._held.release()

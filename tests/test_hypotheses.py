@@ -226,23 +226,6 @@ def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(mon
     assert not assimilation.explain(0.0, generator) and not assimilation.called
 
 
-def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
-    twin, assimilation = ensemble(PLANT)
-    late, (record, _), fitted_in = twin.twins["late"], recorded(PLANT), {"late": [], "lags": []}
-    for name, fit in assimilation.fits.items():
-
-        def update(*_, name=name):
-            fitted_in[name].append(done)
-            return 100.0 if name == "late" else 1.0
-
-        monkeypatch.setattr(fit, "update", update)
-    replayed = "rt_torchrl.steps.hypotheses.assimilation.misfit"
-    monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is late else 1.0)
-    for done in range(20):  # noqa: B007  (the updates read it)
-        assimilation.update([record], (), 1, torch.Generator())
-    assert fitted_in == {"late": [0, 2, 5, 10, 19], "lags": list(range(20))}
-
-
 @pytest.mark.parametrize("always", [False, True])
 def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
     """But for state feedback, which plans on it, and where a hypothesis fails and it is planned on again."""

@@ -1,6 +1,5 @@
 """Step 2: losses of TorchRL traced and by hand, TD errors, sums of rewards, the memory D_L, and a known optimum."""
 
-import contextlib
 import copy
 
 import numpy as np
@@ -267,23 +266,6 @@ def test_priorities_are_sizes_of_errors_whatever_the_loss_reports(algorithm):
     assert sizes[1] / sizes[0] == pytest.approx(100.0, rel=0.01)
 
 
-def test_the_actor_climbs_the_value_of_its_actions():
-    """The gradient of −E[q(e, π(e))] by central differences of the policy's weights, and by a step of the optimiser."""
-    found, data, h = learner(), explored(10), 1e-5
-    slope = torch.zeros(1, 2, dtype=torch.float64)
-    with torch.no_grad():
-        for k in range(2):
-            for sign in (1.0, -1.0):
-                found.policy.gain[0, k] += sign * h
-                slope[0, k] += sign * cost_to_go(found, data["observation"]).mean() / (2 * h)
-                found.policy.gain[0, k] -= sign * h
-    keys = [key for key in BATCH if key in scaled(data).keys(include_nested=True)]
-    value, norm = Iteration(found, "actor", keys).eager(*(scaled(data)[key] for key in keys))
-    assert value.item() == pytest.approx(-cost_to_go(found, data["observation"]).mean().item(), rel=0.1)
-    assert norm.item() == pytest.approx(slope.norm().item(), rel=1e-6)
-    assert torch.equal(found.actor_adam.moments[0][0].sign(), slope.sign())
-
-
 @pytest.mark.parametrize(("algorithm", "rates"), [("ddpg", {"kind": Wild}), ("sac", {"actor_rate": 1e308})])
 def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(algorithm, rates):
     """A second step of 1e308 overflows."""
@@ -299,62 +281,6 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
     other = learner(algorithm, critic_iterations=6, actor_iterations=3)
     other.load_state_dict(found.state_dict())
     assert "reason" not in other.update() and not torch.equal(other.policy.gain, before[1]["gain"])
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "error"), [("td3", None), ("ddpg", KeyboardInterrupt), ("ddpg", FloatingPointError)]
-)
-def test_small_operations_run_on_one_thread_of_torch(algorithm, error, monkeypatch):
-    found, before, seen = learner(algorithm, critic_iterations=2, actor_iterations=2), torch.get_num_threads(), []
-    filled(explored(20), found)
-    refresh = LongTermMemory.refresh
-
-    def counted(memory, *arguments):
-        seen.append(torch.get_num_threads())
-        if error is not None:
-            raise error("stop")
-        return refresh(memory, *arguments)
-
-    monkeypatch.setattr(LongTermMemory, "refresh", counted)
-    torch.set_num_threads(2)
-    try:
-        with pytest.raises(KeyboardInterrupt) if error is KeyboardInterrupt else contextlib.nullcontext():
-            found.update()
-        assert seen and set(seen) == {1} and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_td_error_is_that_of_the_target_critic_and_bootstraps_through_truncation():
-    """|r + γ q′(e′, π(e′)) − q(e, a)| by hand; the end of an episode (done, not terminated) is no end of the return."""
-    found, data = learner(target_rate=0.3), scaled(explored(10))
-    filled(explored(10), found)
-    found.update()
-    first = data[:6].clone()
-    following = first["next", "observation"]
-    with torch.no_grad():
-        ahead = values(found, following, found.policy(following) / HALF_RANGE, target=True)[0]
-        expected = (
-            first["next", "reward"] + GAMMA_IN_TORCHRL * ahead - values(found, first["observation"], first["action"])[0]
-        ).abs()[:, 0]
-        assert not torch.equal(ahead, values(found, following, found.policy(following) / HALF_RANGE)[0])
-    for done in (False, True):
-        first["next", "done"].fill_(done)
-        torch.testing.assert_close(found.td_errors(first), expected, rtol=1e-10, atol=1e-12)  # |δ| = √δ²
-
-
-def test_target_follows_at_its_rate():
-    """After one critic iteration: w′ = (1 − τ) w_0 + τ w_1."""
-    found = learner(target_rate=0.3, critic_iterations=1, actor_iterations=0)
-    weights, targets = (
-        getattr(found.loss, f"{name}value_network_params").flatten_keys(".") for name in ("", "target_")
-    )
-    before = weights.detach().clone()
-    filled(explored(10), found)
-    found.update()
-    for name, after in weights.items():
-        assert not torch.equal(after, before[name])
-        torch.testing.assert_close(targets[name], 0.7 * before[name] + 0.3 * after.detach())
 
 
 @pytest.mark.parametrize(
@@ -391,18 +317,6 @@ def test_sampled_errors_are_refreshed():
     # δ is that of the critic before its step, which is the one they were stored with.
     assert 0 < changed.sum() <= 32
     torch.testing.assert_close(after[changed], before[changed], rtol=1e-5, atol=0)
-
-
-def test_restart_forgets_the_moments_of_the_policys_optimiser():
-    found = learner(critic_iterations=0, actor_iterations=1, actor_rate=0.01)
-    filled(explored(10), found)
-    found.update(), found.update()
-    assert found.actor_adam.steps[0] == 2.0
-    found.restart()
-    before = found.policy.gain.detach().clone()
-    found.update()
-    # Adam's first step has the length of the rate in each direction, up to ε = 1e-8 over the gradient.
-    torch.testing.assert_close((found.policy.gain - before).abs(), torch.full((1, 2), 0.01).double(), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "sac"])
@@ -517,18 +431,6 @@ def test_sampling_follows_the_priorities(alpha, monkeypatch):
     weights = (ERRORS + tol) ** alpha
     expected = 20_000 * weights / weights.sum()
     assert chisquare(counts.numpy(), expected.numpy() * counts.sum().item() / expected.sum().item()).pvalue > 1e-3
-
-
-def test_importance_weights_undo_the_sampling(monkeypatch):
-    """w_i = (P_min/P_i)^β: one for the least likely, and for β = 1 the weighted draw is uniform."""
-    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", 0.05)
-    found = memory(prioritisation=0.8, correction=0.7)
-    found.store(labelled(list(range(8))), ERRORS)
-    batch = found.sample(400)
-    P = (ERRORS + 0.05) ** 0.8
-    expected = (P.min() / P[batch["label"].long()]) ** 0.7
-    # Priorities are kept in single precision.
-    torch.testing.assert_close(batch["priority_weight"].double(), expected, rtol=1e-5, atol=0)
 
 
 def test_eviction_goes_by_the_present_priorities():

@@ -10,7 +10,6 @@ from test_algorithm import twinning, weights
 from test_belief import EPISODES, REFUTED, Content, belief_of, gains, said
 from test_first_controller import begun
 
-from rt_torchrl import RefereeConfig
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.steps import plan
@@ -136,24 +135,6 @@ def test_starts_that_find_nothing_change_no_training(optimiser, monkeypatch):
     assert torch.equal(one, two) and torch.equal(*(training.generator.get_state() for training in found))
 
 
-def test_an_interrupt_leaves_the_policy_its_weights(monkeypatch):
-    found = twinning(arm="model_based")
-    found.episode()
-    before = weights(found.policies["model_based"])
-    cost, asked = found.virtual.cost, []
-
-    def interrupted(policy, episodes):
-        asked.append(policy)
-        if len(asked) == 3:
-            raise KeyboardInterrupt
-        return cost(policy, episodes)
-
-    monkeypatch.setattr(found.virtual, "cost", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        found.episode()
-    assert torch.equal(weights(found.policies["model_based"]), before)
-
-
 class Chaotic(DigitalTwin):
     """Episodes like bowls; where the second gain is above 6 the closed loop is chaotic, and costs ripple by 1e-4."""
 
@@ -261,17 +242,3 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
     monkeypatch.setattr(found.virtual, "judge", judged)
     found.start()
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies
-
-
-def test_the_papers_rule_keeps_plans_by_the_twin_and_every_update():
-    found = begun(referee=RefereeConfig(rule="decision_tree"))
-    update = found.learner.update
-
-    def ruined():
-        report = update()
-        found.policies["model_free"].gain.data.fill_(-0.6)
-        return report
-
-    found.learner.update = ruined
-    assert "update_accepted" not in found.episode()
-    assert found.policies["model_free"].gain.detach().unique().tolist() == [-0.6]

@@ -15,13 +15,9 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
-from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
 from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
@@ -101,22 +97,6 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     refused = clone(policies["model_free"], policies["model_based"], **given)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()
-
-
-def test_a_clone_learns_the_actions_of_record_and_flights():
-    """The student has enough weights, the disturbance is seen by nobody, and the teacher is nearly linear."""
-    plant = LinearQuadratic(horizon=4.0, noise=0.0)
-    teacher = PredictiveControl(plant, plant.closure, PredictiveConfig(horizon=2.0, tolerance=1e-9, iterations=100))
-    generator = torch.Generator().manual_seed(0)
-    student = plant.make_policy(generator)
-    draw = lambda: Scenario(0.5 * plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator))  # noqa: E731
-    record = teacher.fly(*draw())
-    one = record._replace(**{name: getattr(record, name)[0] for name in ("states", "actions", "exogenous")})
-    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), ExogenousConfig(), 1, generator=generator)
-    error = Imitation(Belief({}, virtual), 2).imitate(teacher, student, seen=one, draw=draw)
-    unseen = teacher.fly(*draw())
-    imitated = student(plant.observe(torch.zeros(()), unseen.states[:, :-1], unseen.exogenous))
-    assert error < 0.02 and ((imitated - unseen.actions) / 4.0).square().mean().sqrt() < 0.02
 
 
 def test_a_closure_that_diverges_is_refused_and_stays_refused():

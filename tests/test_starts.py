@@ -28,7 +28,7 @@ from rt_torchrl.steps.report import findings
 from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 record_log = recipe("record_log")
 recorded = record_log.recorded
@@ -226,16 +226,6 @@ def test_a_run_from_a_log_is_resumed_without_the_log(tmp_path):
         training(tmp_path / "run", episodes=3, resume=True)
 
 
-def test_columns_of_a_log_may_have_other_names(tmp_path):
-    path = tmp_path / "log.csv"
-    log_of(path, 4.0)
-    path.write_text(path.read_text().replace("force", "F"))
-    with pytest.raises(ValueError, match="has no column force"):
-        training(tmp_path / "run", start=str(path))
-    reads = LogConfig(columns=("F=force",))
-    assert training(tmp_path / "run", start=str(path), log=reads).algorithm.start()["start_cost"] > 0.0
-
-
 def test_model_predictive_control_flies_first(tmp_path):
     found = training(tmp_path, start="mpc", seed=5).algorithm
     report = found.start()
@@ -261,15 +251,3 @@ def test_transitions_of_a_record_are_those_of_a_flight():
         torch.testing.assert_close(found[key], episode[key], rtol=1e-13, atol=1e-13)
     part, rewards = transitions_of(plant, record.part(0, 10, plant.dt)), episode["next", "reward"][:10]
     torch.testing.assert_close(part["next", "reward"], rewards, rtol=1e-13, atol=1e-13)
-
-
-def test_pieces_keep_most_of_a_log():
-    def lengths(*counts, longest=10):
-        states = [torch.arange(float(n + 1)).unsqueeze(-1) for n in counts]
-        segments = [Trajectory(s, s[:-1], s[:-1], 5.0) for s in states]
-        return pieces_of_equal_length(segments, longest, 0.5)
-
-    assert [len(piece.actions) for piece in lengths(25, 31)] == [10] * 5
-    assert [len(piece.actions) for piece in lengths(6, 5)] == [5, 5]
-    assert [piece.start for piece in lengths(25)] == [5.0, 10.0]
-    assert lengths(25)[1].states[0] == 10.0
