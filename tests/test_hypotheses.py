@@ -125,7 +125,7 @@ def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
     )
     report = assimilation.report()
     assert report["hypothesis/lags"] == 1.0 and report["misfit/lags"] < 1e-3 * report[f"misfit/{ALONE}"]
-    assert "'lags' explains the records best" in twin.explanation()
+    assert twin.hypothesis == "lags"
 
 
 def whole_cost(twin, record):

@@ -183,11 +183,12 @@ class Belief:
         if not found or math.isnan(found[-1]):
             return findings()
         quiet = [d for d, one in zip(found, self.flown, strict=True) if one.exploration <= QUIET and not math.isnan(d)]
-        said = alarm(quiet)
+        said, hypothesis = alarm(quiet), self.virtual.twin.hypothesis
         report = findings(paired_difference=found[-1], alarm=float(said is not None))
         if said is None:
             return report
-        return report.set_non_tensor("warning", f"{said}; {self.virtual.twin.explanation()}".rstrip("; "))
+        explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
+        return report.set_non_tensor("warning", said + explained)
 
     @property
     def unexplained(self) -> float:

@@ -119,7 +119,7 @@ class Imitation:
             if first != role:
                 policy.load_state_dict(pupils[first].state_dict())
             elif judged_on is None:
-                report.update(findings(**{f"start_error_{role}": self.of_record(policy, records)}))
+                report.update(findings(**{f"start_error_{role}": self._match(policy, [self._of_record(records)])}))
             else:
                 report = merged(report, self._begun(teacher, role, policy, records, judged_on))
         return report
@@ -129,7 +129,7 @@ class Imitation:
     ) -> TensorDict:
         before, start = copy.deepcopy(policy.state_dict()), self.virtual.judge(policy, judged_on)
         if teacher is None:
-            error = self.of_record(policy, records)
+            error = self._match(policy, [self._of_record(records)])
             wanted = control_cost(self.virtual.twin.plant, records).mean().item()
         else:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
@@ -172,10 +172,6 @@ class Imitation:
         self._match(pupil, pairs)
         pairs.append(self._flown(teacher, pupil, draw()))
         return self._match(pupil, pairs)
-
-    def of_record(self, pupil: nn.Module, record: Trajectory) -> float:
-        """Train the pupil in place to act as in records, without the twin; the error is that of :meth:`imitate`."""
-        return self._match(pupil, [self._of_record(record)])
 
     def _match(self, pupil: nn.Module, pairs: list[tuple[Tensor, Tensor]]) -> float:
         """Fit the pupil's actions in place by the mean square of differences; the RMS, as a share of the ranges."""

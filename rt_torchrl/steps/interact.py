@@ -356,16 +356,10 @@ class Operating:
             if flights and flights[-1].whole and self.step.config.arm != "model_free":
                 self.step.virtual.learn(flights[-1].record)  # step 3 fits the last one
             flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=self.step.wanting)
-            self.step.short_term.append(flight.record)
             flights.append(flight)
             order = self._order_of(flight)
-            if order.name == FIRST:
-                continue
-            policy_flew = True
-            if flight.whole:  # costs of parts cannot be compared with those of windows
-                role, cost = cast(Role, order.name), flight.cost.item()
-                explored = order.strength * self._exploration.spread
-                self.step.belief.append(flight.record, role, cost, explored, order.weights)
+            policy_flew |= order.name != FIRST
+            self.step.keep(flight, order.name, order.strength, order.weights)
         return flights, self._report(flights)
 
     def _order_of(self, flight: Flight) -> Order:
@@ -443,11 +437,15 @@ class Interact(Step):
         cleared = self.clearance.choose(live, self.judged)
         acting, strength = cleared.policy, self.config.exploration.strength(number)
         flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
-        self.short_term.append(flight.record)
-        explored = self.flights.actor.strength * self.config.exploration.spread
-        if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.belief.append(flight.record, cleared.role, flight.cost.item(), explored, acting.state_dict())
+        self.keep(flight, cleared.role, self.flights.actor.strength, acting.state_dict())
         report = merged(report_of_flights([flight]), findings(exploration=self.flights.actor.strength))
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
         return [flight], report.set_non_tensor("live", cleared.role)
+
+    def keep(self, flight: Flight, pilot: str, strength: float, weights: Mapping[str, Tensor]) -> None:
+        """Remember the record of a flight and, if it is one of a whole episode by a policy, what it cost."""
+        self.short_term.append(flight.record)
+        if flight.whole and pilot != FIRST:  # costs of parts cannot be compared with those of episodes
+            explored = strength * self.config.exploration.spread
+            self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), explored, weights)

@@ -584,8 +584,7 @@ def slopes(loss: Tensor, weights: list[nn.Parameter]) -> list[Tensor]:
     return list(torch.autograd.grad(loss, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
 
 
-aten = torch.ops.aten
-PASSED = (aten.detach.default, aten.alias.default)
+PASSED = (torch.ops.aten.detach.default, torch.ops.aten.alias.default)
 """What changes nothing where no gradients are asked for."""
 
 
@@ -593,33 +592,21 @@ def flat(module: GraphModule) -> Callable[..., Sequence[Tensor]]:
     """The function of a traced module, without what changes nothing and what nobody reads.
 
     Weights and other tensors that the module holds become arguments, because each access to them costs as much as a
-    small operation; their transposes are taken once, since these are views of the same numbers.
+    small operation.
     """
-    graph, held = module.graph, dict[str, Tensor]()
+    graph = module.graph
     for node in graph.nodes:
-        if node.op == "get_attr":
-            held[node.target] = getattr(module, node.target).detach()
-        if not node.all_input_nodes:
-            continue
-        source = node.all_input_nodes[0]
         if node.target in PASSED:
-            node.replace_all_uses_with(source)
-        elif node.target is aten.t.default and source.op == "get_attr":
-            name = f"{source.target}_t"
-            held[name] = held[source.target].t()
-            setattr(module, name, held[name])
-            node.op, node.target, node.args = "get_attr", name, ()
-        elif node.target is aten.t.default and source.target is aten.t.default:
-            node.replace_all_uses_with(source.args[0])
+            node.replace_all_uses_with(node.all_input_nodes[0])
     graph.eliminate_dead_code()
-    readers = [node for node in graph.nodes if node.op == "get_attr"]
-    names = sorted({node.target for node in readers})
+    held = [node for node in graph.nodes if node.op == "get_attr"]
     with graph.inserting_before(next(iter(graph.nodes))):
-        arguments = {name: graph.placeholder(f"held_{name}") for name in names}
-    for node in readers:
-        node.replace_all_uses_with(arguments[node.target])
+        for number, node in enumerate(held):
+            node.replace_all_uses_with(graph.placeholder(f"held_{number}"))
+    tensors = [getattr(module, node.target).detach() for node in held]
+    for node in held:
         graph.erase_node(node)
-    return functools.partial(GraphModule(nn.Module(), graph).forward, *(held[name] for name in names))
+    return functools.partial(GraphModule(nn.Module(), graph).forward, *tensors)
 
 
 TOL = 1e-3

@@ -256,8 +256,7 @@ class MultiStart:
         """
         policy = self.planner.policy
         if not self.judges:
-            found = self._descended(planned_on)
-            return findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
+            return self._descended(planned_on)
         present = copy.deepcopy(policy.state_dict())
         self.belief.require_sound_twin(judged_on)
         stays = self.belief.judge(policy, judged_on)
@@ -302,24 +301,24 @@ class MultiStart:
 
     def _from_the_present(self, present: Weights, stays: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
         """A plan from the present weights, or these; one that fails from extreme starts is made again on these, too."""
-        policy, episodes, report = self.planner.policy, planned_on, findings()
-        for _ in range(2):
-            found = self._descended(episodes, usual=planned_on)
-            if found is None:
-                return Plan(present, stays, findings("no plan: the twin diverges", plan_accepted=0.0))
-            report = found
+        policy, episodes = self.planner.policy, planned_on
+        while True:
+            report = self._descended(episodes, usual=planned_on)
+            if not report["plan_accepted"]:
+                return Plan(present, stays, report)
             cost = self.belief.judge(policy, judged_on)
             if cost <= stays and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
             policy.load_state_dict(present)
             self.planner.restart()
-            if not len(self.virtual.extremes) or cost.on_twin > stays.on_twin:
-                break
+            fails_at_extremes = len(self.virtual.extremes) and cost.on_twin <= stays.on_twin
+            if not fails_at_extremes or episodes is not planned_on:
+                refused = findings(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
+                return Plan(present, stays, report.update(refused))
             episodes = self.virtual.with_extremes(planned_on)
-        return Plan(present, stays, report.update(findings(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])))
 
-    def _descended(self, episodes: Scenario, usual: Scenario | None = None) -> TensorDict | None:
-        """The report of a descent; None, and the weights as they were, if the twin diverges where it begins.
+    def _descended(self, episodes: Scenario, usual: Scenario | None = None) -> TensorDict:
+        """The report of a descent; the weights stay as they were if the twin diverges where it begins.
 
         The twin must be sound in the usual episodes alone: what has just flown may diverge from extreme starts.
         """
@@ -331,7 +330,7 @@ class MultiStart:
             self.belief.require_sound_twin(episodes if usual is None else usual)
             policy.load_state_dict(before)
             self.planner.restart()
-            return None
+            return findings("no plan: the twin diverges", plan_accepted=0.0)
 
     def _several(self, episode: int, plan: Plan) -> bool:
         """Whether to plan from other weights, too."""

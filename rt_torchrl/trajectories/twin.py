@@ -149,13 +149,10 @@ class DigitalTwin:
         """
         self._correction = correction
 
-    def corrected(self, policy: nn.Module, costs: Costs) -> Costs:
-        """What is expected on the real system where the twin says these costs of a policy."""
-        return costs if self._correction is None else costs * self._correction(policy).exp()
-
     def expected_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
         """What is expected on the real system of :meth:`episode_costs`, differentiable as these are."""
-        return self.corrected(policy, self.episode_costs(policy, initial_state, exogenous))
+        costs = self.episode_costs(policy, initial_state, exogenous)
+        return costs if self._correction is None else costs * self._correction(policy).exp()
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
@@ -178,10 +175,6 @@ class DigitalTwin:
     def believed_law(self) -> nn.Module:
         """Closure of :attr:`plant` in :attr:`believed`, without the parameters that a hypothesis has beside it."""
         return self.closure
-
-    def explanation(self) -> str:
-        """What the twin says about itself that may explain a wrong prediction; a twin that is alone says nothing."""
-        return ""
 
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""

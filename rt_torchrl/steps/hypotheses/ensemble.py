@@ -95,10 +95,6 @@ class TwinEnsemble(DigitalTwin):
             closure, plant = plant.of_base(closure), plant.base
         return closure
 
-    def explanation(self) -> str:
-        """The hypothesis that replays the records best."""
-        return f"{self.likeliest!r} explains the records best"
-
     def state_dict(self) -> dict[str, Any]:
         """As :meth:`DigitalTwin.state_dict`, and ``hypotheses``: their closures, and the weights of all that count."""
         closures = {name: twin.closure.state_dict() for name, twin in self.twins.items() if name != ALONE}
