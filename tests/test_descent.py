@@ -4,14 +4,10 @@ import math
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
-from rt_torchrl import DigitalTwin, PlannerConfig
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, limited_mean
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
-from rt_torchrl.steps.plan import WholeEpisodes
-from rt_torchrl.trajectories.trajectory import Scenario
 
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
 CURVATURE = torch.tensor([1.0, 4.0, 10.0], dtype=torch.float64)
@@ -250,24 +246,3 @@ def test_the_mean_of_costs_limits_exploding_gradients_alone(case):
     found = limited_mean(costs, weights, limit)
     assert found.item() == pytest.approx(costs.mean().item(), rel=0.0, abs=0.0, nan_ok=True)
     torch.testing.assert_close(gradient(weights, found), torch.tensor(expected).double(), equal_nan=True)
-
-
-class Hunting(DigitalTwin):
-    """Fifty episodes like bowls; in the last one, the cost also ripples by 1e-8 with the gain."""
-
-    def episode_costs(self, policy: nn.Module, initial_state: torch.Tensor, exogenous: torch.Tensor) -> torch.Tensor:
-        gain = policy.gain.flatten()
-        ripple = 1e-8 * torch.sin(1e13 * gain[1])
-        bowl = 1.0 + 0.5 * (gain - torch.tensor([2.0, 3.0]).double()).square().sum()
-        return torch.stack([bowl] * 49 + [bowl + ripple])
-
-
-@pytest.mark.parametrize(("method", "far"), [("multi_start", False), ("single_start", True)])
-def test_a_plan_goes_on_beside_an_episode_whose_gradient_explodes(method, far):
-    plant, policy = LinearQuadratic(), LinearGain([[-1.0, -1.0]])
-    config = PlannerConfig(method=method, iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
-    nothing = torch.zeros(1, 2, dtype=torch.float64)
-    planner = WholeEpisodes(Hunting(plant, plant.closure), policy, config)
-    found = planner.plan(Scenario(nothing, torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)))
-    assert found.start == pytest.approx(13.5)
-    assert (found.best > 3.0) is far

@@ -78,19 +78,6 @@ def test_a_twin_that_diverges_with_the_earlier_closure_too_does_not_end_the_trai
     assert torch.equal(weights(found.policies["model_based"]), before)
 
 
-def test_a_plan_that_was_left_out_has_changed_no_weight(monkeypatch):
-    """The twin diverges in the episodes of the plan alone, and the referee still decides."""
-    found = twinning()
-
-    def diverged(*arguments):
-        raise DivergenceError("plant 'linear_quadratic' diverged")
-
-    monkeypatch.setattr(found.steps["plan"].planning, "plan", diverged)
-    report = found.episode()
-    assert "step left out: " in report["reason"] and report["weight_change"] == 0.0
-    assert "event" in report and report["J_a_model_based"].isfinite()
-
-
 def flying(found, monkeypatch, diverging):
     """Let the twin diverge under the policies of these modules, wherever virtual episodes are flown."""
     cost = found.twin.cost

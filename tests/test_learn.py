@@ -306,19 +306,6 @@ def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, orde
     assert sizes == [350, 200] if algorithm == "ddpg" else [350]
 
 
-def test_sampled_errors_are_refreshed():
-    found, data = learner(critic_iterations=1, actor_iterations=0), explored(10)
-    memory = filled(data, found)
-    before = memory.state_dict()["priorities"]
-    memory.refresh(torch.arange(len(data)), torch.full((len(data),), 100.0))
-    found.update()
-    after = memory.state_dict()["priorities"]
-    changed = after < 10.0
-    # δ is that of the critic before its step, which is the one they were stored with.
-    assert 0 < changed.sum() <= 32
-    torch.testing.assert_close(after[changed], before[changed], rtol=1e-5, atol=0)
-
-
 @pytest.mark.parametrize("algorithm", ["td3", "sac"])
 def test_all_is_drawn_from_the_learners_generator(algorithm):
     errors = []

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from test_export_recipe import RECIPES, leave_run
 from test_extensions import DT, flight
 
@@ -19,7 +19,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.sensors import UnreadInput
-from rt_torchrl.plants.vector_field import LaggedCoefficients, ScaledCoefficients
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -62,15 +61,6 @@ def test_a_scaled_actuator_does_a_share_of_what_it_is_asked_for():
     torch.testing.assert_close(costs, Rollout(base, base.closure).costs(state, exogenous, 0.8 * command))
 
 
-def test_scaled_coefficients_are_those_of_a_scaled_closure():
-    base = LinearQuadratic()
-    plant = ScaledCoefficients(base, 0.5)
-    state, exogenous, command = flight(plant)
-    half = LinearClosure(0.5 * torch.tensor(base.true_closure, dtype=torch.float64))
-    expected = Rollout(base, half)(state, exogenous, command).states
-    torch.testing.assert_close(flown(plant, state, exogenous, command), expected, rtol=1e-12, atol=1e-12)
-
-
 def test_an_unread_input_is_a_sum_of_harmonics_with_its_deviation():
     base = LinearQuadratic()
     plant = UnreadInput(base, "disturbance", 0.5, (0.7, 3.0))
@@ -84,15 +74,6 @@ def test_an_unread_input_is_a_sum_of_harmonics_with_its_deviation():
     drawn = plant.draw_initial_state(20_000, torch.Generator().manual_seed(0))[:, 2:4].sum(-1)
     assert drawn.std().item() == pytest.approx(0.5, rel=0.02)
     assert not plant.at_rest(state[:, :2])[:, 2:].any()
-
-
-def test_the_lift_of_fast_blade_elements_is_that_of_the_drone():
-    base = FlappingWing(horizon=0.1)
-    plant = LaggedCoefficients(base, 1e-9, (0.0, 0.0) * base.span_nodes, elements=(base.span_nodes,))
-    state, exogenous, _ = flight(base, steps=200)
-    command = torch.tensor([80.0, -10.0], dtype=torch.float64).expand(2, 200, 2)
-    found = flown(plant, plant.at_rest(state), exogenous, command)[..., :4]
-    torch.testing.assert_close(found, flown(base, state, exogenous, command), rtol=1e-4, atol=1e-7)
 
 
 def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
