@@ -294,7 +294,8 @@ def test_the_state_is_kept():
 
 
 def counters(assimilation):
-    return {name: (fit.least, fit.turns.waiting, fit.turns.pause) for name, fit in assimilation.fits.items()}
+    turns = assimilation.turns
+    return {name: (fit.least, turns[name].waiting, turns[name].pause) for name, fit in assimilation.fits.items()}
 
 
 def test_hypotheses_are_chosen_by_name():

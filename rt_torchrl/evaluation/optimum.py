@@ -11,10 +11,12 @@ from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.trajectories.rollout import DivergenceError
 
+SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
+"""Adam's options, beside β₂ = 0.99, of the two halves of an approach."""
 TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
 FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
 """Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
@@ -77,8 +79,8 @@ def exact_optimum(
         def cost() -> Tensor:
             return rollout.costs(state, exogenous).mean()
 
-        if approaching:
-            by_small_steps(policy, cost, approaching)
+        for config in SMALL_STEPS if approaching else ():
+            Descent(policy, config, second_moment=0.99).run(cost, approaching // 2)
         return Descent(policy, TO_THE_END).run(cost, steps).best
 
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]

@@ -41,10 +41,6 @@ class DescentConfig:
     tolerance: NotNegative = 1e-9
 
 
-SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
-"""Adam's options for the two halves of :func:`by_small_steps`, beside β₂ = 0.99."""
-
-
 class Descended(NamedTuple):
     """Cost at the start and at the best weights, norm of its first gradient (not relative), and iterations."""
 
@@ -159,23 +155,6 @@ class Descent:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._optimiser.load_state_dict(state)
-
-
-def by_small_steps(module: nn.Module, cost: Callable[[], Tensor], iterations: int) -> None:
-    """Descend by Adam with small steps, half of them four times smaller than the others; the best weights stay.
-
-    L-BFGS alone takes a perceptron to the next poor minimum. Small steps first lead past it.
-
-    Args:
-        module: module with the weights.
-        cost: function that returns the scalar cost at the module's present weights.
-        iterations: number of gradients.
-
-    Raises:
-        FloatingPointError: if the cost diverges at the weights that the descent starts from.
-    """
-    for config in SMALL_STEPS:
-        Descent(module, config, second_moment=0.99).run(cost, iterations // 2)
 
 
 class _Finished(Exception):

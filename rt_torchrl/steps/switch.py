@@ -100,10 +100,11 @@ class ExpectedCost:
         return "keep"
 
     def state_dict(self) -> dict[str, Any]:
-        return {"live": self.live, "stall_count": self.stall_count}
+        """The live role and all counters."""
+        return {name: value for name, value in vars(self).items() if name != "config"}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.live, self.stall_count = state["live"], state["stall_count"]
+        vars(self).update(state)
 
 
 class DecisionTree(ExpectedCost):
@@ -132,13 +133,6 @@ class DecisionTree(ExpectedCost):
             self.live = self.idle
             return "swap"
         return "keep"
-
-    def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"worse_count": self.worse_count}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state)
-        self.worse_count = state["worse_count"]
 
 
 def make_referee(config: RefereeConfig, live: Role) -> Referee:

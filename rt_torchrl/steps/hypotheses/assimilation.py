@@ -45,16 +45,17 @@ LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
 
 
+@dataclasses.dataclass
 class Turns:
     """A hypothesis that explains nothing is fitted in ever fewer episodes, any other one in all.
 
-    Attributes:
+    Args:
         waiting: number of episodes until the next fit; negative in an episode in which it is due.
         pause: number of episodes to wait after the next fit, if the hypothesis is hopeless then, too.
     """
 
-    def __init__(self) -> None:
-        self.waiting, self.pause = 0, 1
+    waiting: int = 0
+    pause: int = 1
 
     def due(self) -> bool:
         """Whether a fit is due in this episode; called once in each."""
@@ -67,12 +68,6 @@ class Turns:
             self.waiting, self.pause = 0, 1
         elif self.waiting < 0:
             self.waiting, self.pause = self.pause, min(2 * self.pause, LONGEST_PAUSE)
-
-    def state_dict(self) -> dict[str, int]:
-        return {"waiting": self.waiting, "pause": self.pause}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.waiting, self.pause = state["waiting"], state["pause"]
 
 
 class Reread(Extension):
@@ -169,7 +164,7 @@ class Fit:
         )
         self.short = Assimilation(twin.of(Reread(twin.plant)), short)
         self.whole = Assimilation(twin, measured)
-        self.least, self.turns = math.inf, Turns()
+        self.least = math.inf
         self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
@@ -244,13 +239,11 @@ class Fit:
         return [record._replace(states=self.twin.plant.at_rest(record.states)) for record in records]
 
     def state_dict(self) -> dict[str, Any]:
-        counters = {"least": self.least, **self.turns.state_dict()}
-        stages = {"short": self.short.state_dict(), "whole": self.whole.state_dict()}
-        return counters | {"closure": self.twin.closure.state_dict(), "first": self._first, **stages}
+        closures = {"closure": self.twin.closure.state_dict(), "first": self._first}
+        return closures | {"least": self.least, "short": self.short.state_dict(), "whole": self.whole.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.least, self._first = state["least"], state["first"]
-        self.turns.load_state_dict(state)
         self.twin.closure.load_state_dict(state["closure"])
         self.short.load_state_dict(state["short"])
         self.whole.load_state_dict(state["whole"])
@@ -304,7 +297,7 @@ class EnsembleAssimilation(Assimilation):
         self.ensemble, self.hypotheses = twin, hypotheses
         self.segment = max(2, twin.plant.n_steps // SHORT)
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
-        self.always, self.turns = always, Turns()
+        self.always, self.turns = always, {name: Turns() for name in twin.twins}
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call or set(twin.weights) != {ALONE}
         self._before: float | None = None
@@ -323,7 +316,7 @@ class EnsembleAssimilation(Assimilation):
         """
         believed = self.fits.get(self.ensemble.likeliest)
         self._before = None if believed is None else believed.cost(records)
-        if self.turns.due() or self.always or ALONE in self.ensemble.weights:
+        if self.turns[ALONE].due() or self.always or ALONE in self.ensemble.weights:
             found = super().update(records, processes, count, generator)
         else:
             self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
@@ -354,14 +347,13 @@ class EnsembleAssimilation(Assimilation):
         records = self._records
         self.misfits = {ALONE: misfit(self.ensemble.twins[ALONE], records, self.segment)}
         for name, fit in self.fits.items():
-            if fit.turns.due():
+            if self.turns[name].due():
                 self.misfits[name] = fit.update(records, generator, self.length)
             else:
                 self.misfits[name] = misfit(fit.twin, records, self.segment)
         shares = evidence(self.misfits)
-        self.turns.rest(hopeless=shares[ALONE] < HOPELESS)
-        for name, fit in self.fits.items():
-            fit.turns.rest(hopeless=shares[name] < HOPELESS)
+        for name, turns in self.turns.items():
+            turns.rest(hopeless=shares[name] < HOPELESS)
         self.ensemble.weights = counting(shares)
 
     def report(self) -> dict[str, float | str]:
@@ -395,7 +387,7 @@ class EnsembleAssimilation(Assimilation):
             "misfits": dict(self.misfits),
             "weights": self.ensemble.weights,
             "called": self.called,
-            "alone": self.turns.state_dict(),
+            "turns": {name: dataclasses.asdict(turns) for name, turns in self.turns.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -404,7 +396,7 @@ class EnsembleAssimilation(Assimilation):
             fit.load_state_dict(state["fits"][name])
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
         self.called = state["called"]
-        self.turns.load_state_dict(state.get("alone", Turns().state_dict()))  # earlier versions fitted it always
+        self.turns = {name: Turns(**saved) for name, saved in state["turns"].items()}
 
 
 def counting(shares: dict[str, float]) -> dict[str, float]:
