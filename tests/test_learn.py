@@ -150,7 +150,7 @@ def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, ret
             found = flat[kind](batch)
             torch.manual_seed(k)
             expected = Iteration(eager, kind, keys).eager(*batch)
-            assert_equal(dict(enumerate(found)), dict(enumerate(expected)))
+            assert_equal(found, expected)
         if k == 2:
             traced.restart(), eager.restart()
         if k == 4:

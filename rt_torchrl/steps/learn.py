@@ -390,11 +390,10 @@ class ActorCritic:
                     name = (what, *keys)
                     if name not in self._iterations:
                         self._iterations[name] = Iteration(self, what, keys)
-                    iteration = self._iterations[name]
-                    results = dict(zip(iteration.names, iteration(batch), strict=True))
+                    results = self._iterations[name](batch)
                     errors += [results.pop("errors")] if "errors" in results else []
-                    for name, value in results.items():
-                        found.setdefault(name, []).append(value)
+                    for entry, value in results.items():
+                        found.setdefault(entry, []).append(value)
                 if errors:
                     sizes = torch.stack(errors)
                     unsound = ~sizes.isfinite().all(-1)
@@ -506,44 +505,43 @@ class Iteration:
         self.learner, self.keys = learner, list(keys)
         self.critic, self.actor = kind != "actor", kind != "critic"
         self.target = learner.target if kind == "both" or (learner.method.delay == 0 and self.critic) else None
-        names = ("critic_loss", "errors", "td_error", "critic_gradient") if self.critic else ()
-        self.names = (*names, "value", "actor_gradient") if self.actor else names
-        self._graph: Callable[..., Sequence[Tensor]] | None = None
+        self._graph: Callable[..., dict[str, Tensor]] | None = None
 
     @torch.no_grad()
-    def __call__(self, batch: Sequence[Tensor]) -> Sequence[Tensor]:
+    def __call__(self, batch: Sequence[Tensor]) -> dict[str, Tensor]:
         """Make the iteration.
 
         Args:
             batch: tensors of a batch, in the order of the keys.
 
         Returns:
-            What ``names`` names.
+            Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
         """
         if self._graph is None:
             self._graph = self._traced(batch)
         return self._graph(*batch)
 
     @torch.enable_grad()
-    def eager(self, *batch: Tensor) -> list[Tensor]:
+    def eager(self, *batch: Tensor) -> dict[str, Tensor]:
         """The iteration as TorchRL and torch make it."""
         learner = self.learner
         transitions = TensorDict(dict(zip(self.keys, batch, strict=True)), batch_size=[len(batch[0])])
         losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
-        results = list[Tensor]()
+        results: dict[str, Tensor] = {}
         steps = list[tuple[Adam, list[Tensor]]]()
         if self.critic:
             loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
             gradients = slopes(loss, learner.critic_adam.weights)
             errors = learner.sizes(transitions["td_error"].detach())
-            results += [loss.detach(), errors, errors.mean(), norm_of(gradients)]
+            results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
+            results["critic_gradient"] = norm_of(gradients)
             steps.append((learner.critic_adam, gradients))
         if self.actor:
             loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
             gradients = slopes(loss, learner.actor_adam.weights)
             norm = norm_of(gradients)
             share = (learner.method.gradient_limit / (norm + TINY)).clamp(max=1.0)
-            results += [-losses["loss_actor"].detach(), norm]
+            results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
             steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
         relaxed = learner.critic_adam.weights if self.critic and learner.method.relaxed else []
         before = [weight.detach().clone() for weight in relaxed]
@@ -556,7 +554,7 @@ class Iteration:
             self.target.step()
         return results
 
-    def _traced(self, batch: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
+    def _traced(self, batch: Sequence[Tensor]) -> Callable[..., dict[str, Tensor]]:
         """The iteration as a flat graph, or as it is where it cannot be traced; nothing is changed."""
         learner = self.learner
         state = [*learner.loss.parameters(), *learner.loss.buffers()]
@@ -588,7 +586,7 @@ PASSED = (torch.ops.aten.detach.default, torch.ops.aten.alias.default)
 """What changes nothing where no gradients are asked for."""
 
 
-def flat(module: GraphModule) -> Callable[..., Sequence[Tensor]]:
+def flat(module: GraphModule) -> Callable[..., dict[str, Tensor]]:
     """The function of a traced module, without what changes nothing and what nobody reads.
 
     Weights and other tensors that the module holds become arguments, because each access to them costs as much as a
