@@ -9,9 +9,6 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
-from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
@@ -161,16 +158,3 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
 def test_a_bad_segment_is_refused():
     with pytest.raises(ValueError, match="segment=-1"):
         AssimilationConfig(segment=-1)
-
-
-@pytest.mark.slow
-def test_drag_at_zero_angle_is_not_lost_on_the_way():
-    """b is 3 % of the drag, so that a step may give it up while a and c are still far from theirs."""
-    plant = FlappingWing(horizon=1.0)
-    generator = torch.Generator().manual_seed(0)
-    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    (record,) = TrimmedPD(plant).fly(state, exogenous).each()
-    for first in ((1.159, 0.0530, 2.100), (1.461, 0.0232, 1.610), (2.188, 0.0296, 0.816)):
-        closure = QuasiSteadyPolar(torch.tensor(first, dtype=torch.float64))
-        of_segments(plant, closure, method="levenberg_marquardt", iterations=40).update([record], [], 1, generator)
-        torch.testing.assert_close(closure.coefficients, plant.closure.coefficients, rtol=0.01, atol=0.0)

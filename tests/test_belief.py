@@ -321,11 +321,3 @@ def play(config, script, live="model_free"):
 )
 def test_every_branch(script, expected):
     assert play(RefereeConfig(), script)[0] == expected
-
-
-@pytest.mark.parametrize("patience", [0, 1, 4])
-def test_swap_and_clone_need_more_than_their_patience(patience):
-    config = RefereeConfig(patience=patience, clone_patience=patience)
-    for costs, event in ((WORSE, "swap"), (BETTER, "clone")):
-        events = [e for e, *_ in play(config, [(costs, STALLED)] * (2 * patience + 2))[0]]
-        assert events == (["keep"] * patience + [event]) * 2

@@ -8,13 +8,11 @@ from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from scipy.optimize import minimize
 from seeds_and_numbers import double
 from small_runs import small_run, stepped_cost
-from torch import nn
 
 from rt_torchrl import SaturatedMLP
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
-from rt_torchrl.evaluation.checks import engine_gap
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 from rt_torchrl.plants.actuators import StickingActuator
@@ -136,34 +134,6 @@ def test_the_engineering_task_beats_jonkman_in_all_his_merits(seed):
         for name in ("mean power [MW]", "pitch travel [deg/s]", "speed above rated [rad/s]")
     )
     assert power >= 1.0 and travel <= 1.5 and over <= 0.8
-
-
-class TwoParts(nn.Module):
-    """A closure with a part that can be frozen."""
-
-    def __init__(self, plant):
-        super().__init__()
-        self.held, self.trained = plant.make_closure(torch.Generator()), plant.make_closure(torch.Generator())
-
-    def forward(self, features):
-        return 0.5 * (self.held(features) + self.trained(features))
-
-
-@pytest.mark.parametrize("held", ["held", "held and trained"])
-def test_weights_that_are_frozen_are_left_out(held):
-    plant = LinearQuadratic()
-    closure, policy = TwoParts(plant), plant.make_policy(torch.Generator().manual_seed(0))
-    for part in held.split(" and "):
-        getattr(closure, part).requires_grad_(False)
-    unseen = UnseenEpisodes(plant, 2)
-    # Rounding of forty intervals.
-    assert engine_gap(plant, closure, policy, unseen) < 1e-13
-    # The continuous adjoint differs by the order of its step: 1e-4 for 0.1 s times the 1/120 of the local error.
-    assert 0.0 < engine_gap(plant, closure, policy, unseen, "odeint_adjoint") < 1e-5
-    policy.requires_grad_(False)
-    closure.requires_grad_(False)
-    with pytest.raises(ValueError, match="closure TwoParts and policy LinearGain have no weight that is trained"):
-        engine_gap(plant, closure, policy, UnseenEpisodes(plant, 2))
 
 
 class Half(Autograd):

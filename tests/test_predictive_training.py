@@ -9,7 +9,6 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import RECIPES, recipe
 
-from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.loaded_run import load_run
@@ -17,7 +16,6 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
 from rt_torchrl.steps.plan import make_planner
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
@@ -97,33 +95,6 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     refused = clone(policies["model_free"], policies["model_based"], **given)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()
-
-
-def test_a_closure_that_diverges_is_refused_and_stays_refused():
-    plant = LinearQuadratic(horizon=2.0, noise=0.5)
-    generator, closure = torch.Generator().manual_seed(0), LinearClosure(torch.zeros(2, 2))
-    algorithm = ReinforcementTwinning(
-        PlantEnv(plant),
-        DigitalTwin(plant, closure),
-        model_free=plant.make_policy(generator),
-        model_based=PredictiveControl(plant, closure, PLANNER.receding_horizon),
-        config=dataclasses.replace(SMALL, planner=PLANNER, assimilation=FIT),
-        generator=generator,
-    )
-    algorithm.episode()
-    sound = closure.matrix.detach().clone()
-    fit = algorithm.assimilation.update
-
-    def diverging(*arguments):
-        found = fit(*arguments)
-        with torch.no_grad():
-            closure.matrix.fill_(1e8)
-        return found
-
-    algorithm.assimilation.update = diverging
-    report = algorithm.episode()
-    assert report["closure_refused"] == 1.0 and torch.equal(closure.matrix, sound)
-    assert algorithm.policies["model_based"].closure is closure
 
 
 def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
-from tensordict import TensorDict
 from test_classical import PD
 from test_export_recipe import recipe
 from test_hypotheses import ASSIMILATION as NEWTON
@@ -24,10 +23,8 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import clones
-from rt_torchrl.steps.report import findings
 from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 record_log = recipe("record_log")
@@ -81,34 +78,6 @@ def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
     assert not len(found.start()) and found.referee.live == live_of(earlier)
     assert all(clones(policy, known.policy(role)) for role, policy in found.policies.items())
     assert torch.equal(found.twin.closure.matrix, known.closure.matrix) and not found.short_term
-
-
-@pytest.mark.parametrize("resumed", [False, True])
-def test_a_twin_that_diverges_falls_back_to_the_closure_that_the_training_started_with(earlier, tmp_path, resumed):
-    run, first = training(tmp_path, episodes=1, start=str(earlier)), load_run(earlier).closure.matrix.detach()
-    if resumed:
-        run.train()
-        run = training(tmp_path, resume=True, start=str(earlier))
-    else:
-        run.algorithm.start()
-    found = run.algorithm
-    closure, outcomes = found.twin.closure, [DivergenceError("the twin diverged"), findings()]
-
-    def step(episode):
-        outcome = outcomes.pop(0)
-        if isinstance(outcome, Exception):
-            raise outcome
-        return episode.update(outcome)
-
-    torch.nn.init.constant_(closure.matrix, 1e300)
-    assert found._sound(step, TensorDict())["closure_refused"] == 1.0
-    assert torch.equal(closure.matrix, first)
-    # In step 4, too: of a descent of one gradient the weights stay that it begins with.
-    torch.nn.init.constant_(closure.matrix, 1e3)
-    found.assimilation.config = dataclasses.replace(found.assimilation.config, iterations=1)
-    record = found.flights.fly_first(found.policies["model_based"]).record
-    assert found.assimilation.update([record], (), 1, torch.Generator()).start == torch.inf
-    assert torch.equal(closure.matrix, first)
 
 
 def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path):

@@ -17,7 +17,6 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
-from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.sensors import UnreadInput
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.trajectories.rollout import Rollout
@@ -49,16 +48,6 @@ def test_every_system_fulfils_the_contract_and_reads_what_its_twin_knows(plant, 
     check_plant(system, steps=5, traced=False, trained=False)
     assert system.readings == base.states and system.name == plant
     assert set(systems.SYSTEMS[name]) <= set(systems.PARTS)
-
-
-def test_a_scaled_actuator_does_a_share_of_what_it_is_asked_for():
-    base = LinearQuadratic()
-    plant = ScaledActuator(base, "force", 0.8)
-    state, exogenous, command = flight(plant)
-    expected = flown(base, state, exogenous, 0.8 * command)
-    torch.testing.assert_close(flown(plant, state, exogenous, command), expected, rtol=1e-12, atol=1e-12)
-    costs = Rollout(plant, plant.closure).costs(state, exogenous, command)
-    torch.testing.assert_close(costs, Rollout(base, base.closure).costs(state, exogenous, 0.8 * command))
 
 
 def test_an_unread_input_is_a_sum_of_harmonics_with_its_deviation():

@@ -395,12 +395,7 @@ class ActorCritic:
                     for entry, value in results.items():
                         found.setdefault(entry, []).append(value)
                 if errors:
-                    sizes = torch.stack(errors)
-                    unsound = ~sizes.isfinite().all(-1)
-                    if unsound.any():
-                        where = first + 1 + int(unsound.int().argmax())
-                        raise FloatingPointError(f"a target or value of critic iteration {where} is not finite")
-                    self.memory.refresh(drawn["index"], sizes.flatten())
+                    self.memory.refresh(drawn["index"], torch.cat(errors))
         scale = config.reward_scale
         return TensorDict({name: torch.stack(v).mean() / scale ** POWERS[name] for name, v in found.items()})
 
@@ -675,7 +670,8 @@ class LongTermMemory:
         """Give sampled transitions their new TD errors δ; of several for one transition the last one counts.
 
         Raises:
-            FloatingPointError: if one is not finite in single precision; none is then given.
+            FloatingPointError: if one is not finite in single precision, as after an update that has diverged; none is
+                then given.
         """
         errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
         if not errors.isfinite().all():
