@@ -214,7 +214,7 @@ class RunConfig:
         return dataclasses.replace(twinning, exploration=exploration)
 
     def defaults(self) -> "RunConfig":
-        """The defaults of all options on a command line, given the preset, start, closure and sensors that it asks for.
+        """The defaults of all options on a command line, given the preset, start and closure that it asks for.
 
         See :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
