@@ -14,7 +14,14 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.config import (
+    AssimilationConfig,
+    LearnerConfig,
+    PlannerConfig,
+    RefereeConfig,
+    TwinningConfig,
+    other_than,
+)
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -74,7 +81,8 @@ def critics(found):
 
 def scripted(found, live, idle):
     """Make step 6 compare these costs."""
-    costs = {found.policies[found.referee.live]: live, found.policies[found.referee.idle]: idle}
+    acts = found.referee.live
+    costs = {found.policies[acts]: live, found.policies[other_than(acts)]: idle}
     found.belief.judge = lambda policy, episodes: Judged(costs[policy], costs[policy])
 
 
@@ -175,7 +183,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
         "model_free": lambda: found.learner.actor_adam.steps[0].item(),
         "model_based": lambda: found.planner.descent._optimiser.state,
     }
-    idle, before = found.referee.idle, weights(found.policies[live])
+    idle, before = other_than(live), weights(found.policies[live])
     assert all(state() for state in optimisers.values())
     assert not torch.equal(weights(found.policies[idle]), before)
     scripted(found, live=1.0, idle=2.0)

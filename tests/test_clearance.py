@@ -15,7 +15,7 @@ from rt_torchrl.runs.real_side import simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import as_written
-from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.config import RefereeConfig, other_than
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
@@ -66,7 +66,8 @@ def test_a_policy_that_would_leave_them_does_not_act():
     found.planner.policy.gain.data.fill_(0.05)
     wild = LinearGain([[80.0, -80.0]]).state_dict()
     found.policies[found.referee.live].load_state_dict(wild)
-    idle, live = found.referee.idle, found.referee.live
+    live = found.referee.live
+    idle = other_than(live)
     cleared = found.steps["interact"].clearance.choose(live, 5)
     assert cleared.role == idle and f"{live} may not act" in cleared.report["reason"]
     assert cleared.report["predicted_violations"] == 0.0

@@ -9,7 +9,7 @@ from test_algorithm import LEARNING, STEPS, flown, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig
+from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig, other_than
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import same_architecture
@@ -75,7 +75,7 @@ def test_a_clone_event_distils(live):
     found = two_architectures()
     found.referee.live = live
     episode = flown(found, *STEPS[:-1])
-    idle = found.referee.idle
+    idle = other_than(live)
     before, replaced = weights(found.policies[live]), weights(found.policies[idle])
     judge, poor = found.belief.judge, found.policies[idle]
 

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
+from rt_torchrl.steps.config import Role, TwinningConfig, other_than
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import Step, findings, merged, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
@@ -271,7 +271,7 @@ class Clearance:
         if not self.limited or not self.virtual.processes:
             return Cleared(self.policies[live], live, findings())
         episodes, reasons = self.virtual.draw(count), list[str]()
-        for role in (live, *(other for other in ROLES if other != live)):
+        for role in (live, other_than(live)):
             share = self.predicted(self.policies[role], episodes)
             if share == 0.0:
                 self._last = {"role": role, "weights": copy.deepcopy(self.policies[role].state_dict())}

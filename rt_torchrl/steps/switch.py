@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import ROLES, RefereeConfig, Role
+from rt_torchrl.steps.config import ROLES, RefereeConfig, Role, other_than
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
 from rt_torchrl.steps.plan import Planner
@@ -28,13 +28,11 @@ class Evidence(NamedTuple):
             with the paper's rule, mean J_a on the twin.
         idle_cost: the same of the idle policy over the same virtual episodes; infinite if the twin diverges with it.
         idle_weight_change: relative change ‖w^i − w^{i−1}‖/‖w^i‖ of the idle policy's weights over this episode.
-        real_costs: J_a of the latest real episodes, oldest first.
     """
 
     live_cost: float
     idle_cost: float
     idle_weight_change: float
-    real_costs: tuple[float, ...] = ()
 
 
 @runtime_checkable
@@ -46,10 +44,6 @@ class Referee(Protocol):
 
     live: Role
     """Role that acts in the next real episode."""
-
-    @property
-    def idle(self) -> Role:
-        """Role that does not act."""
 
     def decide(self, evidence: Evidence) -> Event:
         """Judge the policies after an episode, and swap their roles if that is the decision.
@@ -81,13 +75,9 @@ class ExpectedCost:
         self.live: Role = live
         self.stall_count = 0  # C_w
 
-    @property
-    def idle(self) -> Role:
-        return "model_based" if self.live == "model_free" else "model_free"
-
     def decide(self, evidence: Evidence) -> Event:
         if evidence.idle_cost < evidence.live_cost:
-            self.live, self.stall_count = self.idle, 0
+            self.live, self.stall_count = other_than(self.live), 0
             return "swap"
         return self._stalled(evidence.idle_weight_change)
 
@@ -130,7 +120,7 @@ class DecisionTree(ExpectedCost):
         self.worse_count, self.stall_count = self.worse_count + 1, 0
         if self.worse_count > self.config.patience:
             self.worse_count = 0
-            self.live = self.idle
+            self.live = other_than(self.live)
             return "swap"
         return "keep"
 
@@ -184,7 +174,8 @@ class Switch(Step):
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        judged_on, live, idle = self.belief.virtual.draw(self.count), self.referee.live, self.referee.idle
+        judged_on, live = self.belief.virtual.draw(self.count), self.referee.live
+        idle = other_than(live)
         costs = {role: self.belief.judge(self.policies[role], judged_on) for role in ROLES}
         diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].on_twin)]
         if diverged:
@@ -194,7 +185,6 @@ class Switch(Step):
             idle_cost=costs[idle].expected,
             # Weights whose step was left out, because the twin diverged, are as they were.
             idle_weight_change=float(episode.get(("weight_changes", idle), 0.0)),
-            real_costs=tuple(one.cost for one in self.belief.flown),
         )
         event = self.referee.decide(evidence)
         report = findings(*diverged, **{f"J_a_{role}": costs[role].on_twin for role in ROLES})
