@@ -47,7 +47,7 @@ from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, RealFlights
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
-from rt_torchrl.steps.report import EpisodeReport, episode_report, findings, merged, on_device
+from rt_torchrl.steps.report import EpisodeReport, findings, merged, on_device
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
@@ -197,7 +197,10 @@ class ReinforcementTwinning(TensorDictSequential):
         self.episodes_done += 1
         if self.operating:
             self.operating.hand_over(self.referee.live, self.episodes_done)
-        return episode_report(flown)
+        # Numbers, texts and seconds are the report; all else is data that flows between the steps.
+        keys = [key for key in flown.keys() if key != "seconds" and not isinstance(flown[key], str)]  # noqa: SIM118
+        data = [key for key in keys if isinstance(flown[key], TensorDictBase) or flown[key].numel() != 1]
+        return EpisodeReport(flown.exclude("number", *data))
 
     def forward(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda step: None) -> TensorDictBase:
         """Let an episode flow through the steps, after the start before the first one; see :meth:`episode`."""

@@ -105,13 +105,6 @@ class EpisodeReport(TensorDict):
         return "\n".join(lines)
 
 
-def episode_report(episode: TensorDictBase) -> EpisodeReport:
-    """The numbers and texts of an episode, and its seconds; all else is data that flows between the steps."""
-    keys = [key for key in episode.keys() if key != "seconds" and not isinstance(episode[key], str)]  # noqa: SIM118
-    data = [key for key in keys if isinstance(episode[key], TensorDictBase) or episode[key].numel() != 1]
-    return EpisodeReport(episode.exclude("number", *data))
-
-
 def weight_change(module: nn.Module, earlier: Tensor) -> Tensor:
     """The relative change ‖w − w_earlier‖/‖w‖ of a module's weights since they were the vector ``earlier``."""
     now = parameters_to_vector(module.parameters()).detach()
