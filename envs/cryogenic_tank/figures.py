@@ -12,26 +12,16 @@ from rt_torchrl.envs.cryogenic_tank.plant import BAND, CryogenicTank
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REFERENCE_LINE, SAMPLES, TWIN, array, caption
-from rt_torchrl.figures.training import closure_weights, tracked_weights
 
 POINTS = 720
 """Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
-LABELS = {
-    "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),
-    "U_HX": ("heat exchanger $U_{HX}$ [W/(m² K)]", 1.0),
-    "K_JT": ("valve $K_{JT}$ [GPa s²/kg²]", 1e-9),
-}
-"""Label of each coefficient, and the factor to its unit."""
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
-    """Every figure of the tank, by name; its ``closure_weights`` replaces the general figure, which knows no units."""
+    """Every figure of the tank, by name."""
     # A duty cycle has no pressure drops to draw the exchanger over.
     over_drops = [heat_exchanger] if snapshot.plant.actions[0].name == "valve_drop" else []
-    drawn = {figure.__name__: figure(snapshot) for figure in (tank, *over_drops)}
-    if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
-        drawn["closure_weights"] = closure_weights(snapshot, LABELS)
-    return drawn
+    return {figure.__name__: figure(snapshot) for figure in (tank, *over_drops)}
 
 
 @torch.no_grad()

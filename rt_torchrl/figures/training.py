@@ -150,15 +150,13 @@ def learning_curves(snapshot: Snapshot) -> Figure:
 
 
 @torch.no_grad()
-def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] | None = None) -> Figure:
+def closure_weights(snapshot: Snapshot) -> Figure:
     """Each named coefficient of the twin after every episode, with its initial and, if it is known, its true value.
 
     The number above a panel is the relative difference between the last value and the true one.
 
     Args:
         snapshot: snapshot whose episodes report ``closure``, see :func:`tracked_weights`.
-        labels: label with unit, and factor from the coefficient to that unit, by the coefficient's name; by default the
-            label is the name with the unit and the meaning that the closure states.
     """
     columns = tracked_weights(snapshot.episodes)
     true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
@@ -169,13 +167,13 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     title = "Closure weights of the twin over the episodes"
     figure, axes = style.grid(len(columns), wide, title=title, size=size, xlabel="episode")
     for ax, (name, found) in zip(axes, columns.items(), strict=True):
-        label, factor = (labels or {}).get(name, (_label(name, described.get(name, {})), 1.0))
-        ax.plot(np.arange(len(found)), factor * found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
+        ax.plot(np.arange(len(found)), found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if name in start:
-            ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
+            ax.axhline(start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
-            ax.axhline(factor * true[name], label="true", **style.REFERENCE_LINE)
+            ax.axhline(true[name], label="true", **style.REFERENCE_LINE)
         style.logarithmic_if_wide(ax)
+        label = _label(name, described.get(name, {}))
         caption(ax, label, f"{100.0 * (found[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
