@@ -4,7 +4,6 @@ import time
 from dataclasses import dataclass
 
 import torch
-from torchrl.data import Unbounded
 
 from rt_torchrl.systems.environment import AroundSystem
 
@@ -14,16 +13,15 @@ class Injection:
     """A fault that is injected into some intervals of an episode.
 
     Args:
-        kind: the fault. Of sensors: ``dropped`` leaves the state out, ``late`` waits before the reading, ``repeated``
-            gives the whole last reading once more, ``frozen`` holds its first component, ``out_of_range`` and ``nan``
-            set it, ``clock_jump`` moves the clock from the first interval on. Of actuators: ``stuck_actuator`` holds
-            the first action, ``slow_actuator`` lets it follow in part. Of the system: ``raises`` an error,
-            ``ends_early`` truncates the episode.
+        kind: the fault. Of sensors: ``dropped`` leaves the state out, ``late`` waits before the reading, ``frozen``
+            holds its first component, ``out_of_range`` and ``nan`` set it. Of actuators: ``stuck_actuator`` holds the
+            first action, ``slow_actuator`` lets it follow in part. Of the system: ``raises`` an error, ``ends_early``
+            truncates the episode.
         first: first control interval with the fault.
         last: last control interval with the fault; by default the first one alone.
         episode: number of the episode, from 0.
-        value: value of ``out_of_range`` in the entry's unit; seconds of ``late`` and ``clock_jump``; share of the way
-            to the action that ``slow_actuator`` goes in an interval.
+        value: value of ``out_of_range`` in the entry's unit; seconds of ``late``; share of the way to the action that
+            ``slow_actuator`` goes in an interval.
     """
 
     kind: str
@@ -38,53 +36,42 @@ class Injection:
 
 
 class FaultySystem(AroundSystem):
-    """An environment with injected faults and a clock, its entry ``time`` [s].
+    """An environment with injected faults.
 
     Attribute ``injected`` holds the episode, the interval and the kind of every fault so far.
     """
 
-    def __init__(self, env, injections, *, interval, sleep=time.sleep):
+    def __init__(self, env, injections, *, sleep=time.sleep):
         super().__init__(device=env.device, batch_size=env.batch_size)
-        self.env, self.injections, self._interval, self._sleep = env, tuple(injections), interval, sleep
-        self._episode, self._count, self._since, self._offset = -1, 0, 0, 0.0
-        self.injected = []
+        self.env, self.injections, self._sleep = env, tuple(injections), sleep
+        self._episode, self._count, self.injected = -1, 0, []
         self.action_spec, self.reward_spec = env.action_spec.clone(), env.reward_spec.clone()
         self.done_spec, self.observation_spec = env.full_done_spec.clone(), env.full_observation_spec.clone()
-        self.observation_spec["time"] = Unbounded(shape=(*env.batch_size, 1), dtype=torch.float64)
 
     def _reset(self, tensordict=None, **kwargs):
-        self._count, self._since, self._offset, self._sent = 0, 0, 0.0, None
-        return self._timed(self.env.reset(**kwargs))
+        self._count, self._sent = 0, None
+        found = self.env.reset(**kwargs)
+        self._read = found["state"].clone()
+        return found
 
     def begin_window(self):
         self._count = 0
 
-    def _timed(self, found):
-        found["time"] = torch.full((*self.batch_size, 1), self._since * self._interval + self._offset).double()
-        self._reading = found.clone()
-        return found
-
     def _step(self, tensordict):
         self._episode += self._count == 0
         active = {fault.kind: fault for fault in self.injections if fault.acts(self._episode, self._count)}
-        begun = {kind for kind, fault in active.items() if fault.first == self._count}
         self.injected += [(self._episode, self._count, kind) for kind in active]
-        self._count, self._since = self._count + 1, self._since + 1
+        if "frozen" in active and active["frozen"].first == self._count:
+            self._held = self._read[..., 0]
+        self._count += 1
         if "raises" in active:
             raise ConnectionError("no answer (injected)")
         self._sent = self._acted(tensordict["action"].clone(), active)
-        sent = tensordict.exclude("next").set("action", self._sent.clone())
-        found, before = self.env.step(sent)["next"].copy(), self._reading
-        if "clock_jump" in begun:
-            self._offset += active["clock_jump"].value
-        found = self._timed(found)
+        found = self.env.step(tensordict.exclude("next").set("action", self._sent.clone()))["next"].copy()
+        self._read = found["state"].clone()
         state = found["state"] = found["state"].clone()
-        if "frozen" in begun:
-            self._held = before["state"][..., 0]
         for kind, fault in active.items():
-            if kind == "repeated":
-                found.update(before.select(*self.observation_spec.keys()))
-            elif kind == "late":
+            if kind == "late":
                 self._sleep(fault.value)
             elif kind == "ends_early":
                 found.update({key: torch.ones_like(found[key]) for key in ("done", "truncated")})

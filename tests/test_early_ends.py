@@ -7,9 +7,8 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from small_runs import SMALL
-from test_algorithm import flown
 from test_learn import values
-from test_real_system import MILLIMETRES, Rig, connected
+from test_real_system import Rig, connected
 
 from rt_torchrl import (
     DigitalTwin,
@@ -19,7 +18,6 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
-from rt_torchrl.evaluation.unseen import RealEpisodes, UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimisers.descent import DescentConfig
@@ -121,18 +119,6 @@ def test_an_engine_that_integrates_the_field_is_refused():
         CommandCost(plant, plant.closure, 10)
 
 
-def test_a_replay_goes_on_where_the_record_does():
-    plant = Falling()
-    start, inputs = drawn(plant)
-    pushed = torch.full((*inputs.shape[:2], 1), 2.0, dtype=torch.float64)
-    states = Rollout(plant, plant.closure)(start, inputs, pushed).states
-    assert states[:, -1, 0].abs().min() > 2.0 * plant.reach
-    # A record that comes back has ended for good: nothing at first, then ten for each interval.
-    back = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [0.0, 0.0], [0.0, 0.0]]]).double()
-    record = Trajectory(back, torch.zeros(1, 3, 1).double(), torch.zeros(1, 3, 1).double())
-    assert control_cost(Falling(horizon=0.3), record).item() == pytest.approx(20.0 / 3.0, rel=1e-12)
-
-
 def actor_of(plant, policy):
     live = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator().manual_seed(0))
     live.begin(policy, strength=0.0)
@@ -183,16 +169,6 @@ def algorithm(env, plant, config=SMALL, closure=None):
     return ReinforcementTwinning(env, twin, **policies, config=config, generator=generator)
 
 
-def test_a_right_twin_foretells_the_cost_of_an_episode_that_ended():
-    plant = Falling(noise=0.0)  # no input has to be continued
-    quiet = dataclasses.replace(SMALL, exploration=ExplorationConfig(spread=0.0))
-    found = algorithm(PlantEnv(plant, seed=1), plant, quiet, LinearClosure(plant.true_closure))
-    flown(found)
-    assert len(found.short_term[-1].actions) < plant.n_steps
-    (difference,) = found.belief.differences()
-    assert difference == pytest.approx(0.0, abs=1e-9)
-
-
 @pytest.mark.parametrize("system", [pytest.param("simulation", marks=pytest.mark.slow), "real"])
 def test_a_training_learns_from_episodes_of_unequal_length(system):
     plant = Falling(noise=0.01)
@@ -227,17 +203,6 @@ def test_a_training_learns_from_episodes_of_unequal_length(system):
     other = algorithm(env, plant, config)
     other.load_state_dict(found.state_dict())
     assert [len(record.actions) for record in other.short_term] == lengths[-2:]
-
-
-def test_real_episodes_cost_what_simulated_ones_do():
-    plant, policy = Falling(noise=0.0), LinearGain(WEAK)
-    real = RealEpisodes(connected(plant, rig=Rig(plant, seed=1)), 3)
-    flown = real.fly(policy)
-    unseen = UnseenEpisodes(plant, 3)
-    unseen.initial_state, unseen.exogenous = flown.states[:, 0], flown.exogenous
-    # Millimetres and back are rounded.
-    torch.testing.assert_close(control_cost(plant, flown), unseen.control_costs(policy), rtol=1e-9, atol=0.0)
-    assert MILLIMETRES[0] == 1e3 and (flown.states[:, -1, 0].abs() > plant.reach).all()
 
 
 def test_episodes_that_end_at_once_say_so_and_what_to_do():

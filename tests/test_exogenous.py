@@ -47,21 +47,6 @@ def test_samples_have_the_mean_and_covariances_of_the_model():
     assert found.covariance[4, 1, 0] > 0.4 * size.prod() > 10.0 * math.sqrt(2.0 / count) * size.prod()
 
 
-@pytest.mark.parametrize("n", [8, 1201])
-def test_spectrum_of_the_embedding_is_not_negative(n):
-    """The FFT of the circulant is a spectral matrix at each frequency, not negative but for rounding."""
-    for found in (process(autoregressive(n, 0.9, seed=n)), process(bivariate(n, 0.9, 2, 0.8, seed=n), FREE * 2)):
-        C = found.covariance.numpy()
-        circulant = np.concatenate([C, 0.0 * C[:1], C[:0:-1].swapaxes(1, 2)])
-        assert len(circulant) == 2 * n
-        spectrum = np.fft.fft(circulant, axis=0)
-        eigenvalues = np.linalg.eigvalsh(spectrum)
-        assert np.abs(spectrum - spectrum.conj().swapaxes(1, 2)).max() < 1e-12 * eigenvalues.max()
-        assert eigenvalues.min() > -1e-12 * eigenvalues.max()
-        size = np.sqrt(C[0].diagonal())
-        assert (size > 0).all() and (np.abs(C) <= np.outer(size, size) * (1 + 1e-12)).all()
-
-
 def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     n, period = 1200, 300.0
     t = DT * np.arange(n)
@@ -145,23 +130,6 @@ def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
     # A normal number is beyond 2.576 in one of a hundred draws.
     standard = (flat[:, 0] - own[:, 0].mean()) / (deviation[0] * (1 + 1 / m) ** 0.5)
     assert (standard.abs() > 2.576).double().mean().item() == pytest.approx(0.01, abs=5e-4)
-
-
-def test_forty_mixed_large_scales_hold_rare_ones_as_often_as_they_come():
-    """What forty draws say of a cost that grows steeply scatters by less than half of what independent ones say."""
-    m, n, count, repeats = 9, 20, 40, 200
-    level = torch.randn(m, 1, generator=seeded(3), dtype=torch.float64)
-    met = [(one + 0.1 * torch.linspace(0.0, 1.0, n, dtype=torch.float64)).unsqueeze(-1) for one in level]
-    generator = seeded(7)
-
-    def cost(mean):
-        return mean.clamp_min(0.5).square()
-
-    even = torch.stack([cost(mixed(met, count, generator).mean((1, 2))).mean() for _ in range(repeats)])
-    normal = torch.randn(1_000_000, generator=generator, dtype=torch.float64)
-    independent = cost(level.mean() + 0.05 + level.std() * (1 + 1 / m) ** 0.5 * normal)
-    assert even.std() < independent.std() / count**0.5 / 2.0
-    assert even.mean().item() == pytest.approx(independent.mean().item(), abs=4.0 * even.std().item() / repeats**0.5)
 
 
 def test_large_scales_are_mixed_from_the_third_episode_on():

@@ -3,9 +3,6 @@
 import copy
 import ctypes
 import functools
-import gc
-import threading
-import weakref
 
 import numpy as np
 import pytest
@@ -112,52 +109,6 @@ def test_what_is_shared_is_another_program_and_a_buffer_is_compared_where_it_is_
     assert not before.unchanged(module) and Holdings(module).digest != before.digest
 
 
-def recursive(x):
-    return recursive(x - 1.0) if x > 0 else x
-
-
-def local_class():
-    class Local:
-        gain = 2.0
-
-    return Local()
-
-
-def closure_of_itself():
-    def f(x):
-        return f(x)
-
-    return f
-
-
-ODD = [threading.Lock(), (i for i in range(3)), local_class(), recursive, closure_of_itself(), np, Inner().forward]
-ODD += [functools.cache(closure_of_itself()), torch.ops.aten.sin.default, torch.Tensor.sin, Plain, np.sin]
-
-
-@pytest.mark.parametrize("odd", ODD, ids=lambda odd: type(odd).__name__)
-def test_odd_attributes(odd):
-    module = Inner()
-    module.odd = odd
-    before = Holdings(module)
-    assert Holdings(module).digest == before.digest
-    module.odd = None
-    assert not before.unchanged(module) and Holdings(module).digest != before.digest
-
-
-def test_objects_known_by_address_are_kept_alive_and_no_module_is():
-    module, seen, kept = Inner(), set(), []
-    for _ in range(50):  # the address of a lock that is freed would be taken by the next one
-        module.odd = threading.Lock()
-        found = Holdings(module)
-        kept.append(found.alive)
-        assert found.digest not in seen
-        seen.add(found.digest)
-    gone = weakref.ref(module)
-    del module
-    gc.collect()
-    assert gone() is None and found is not None
-
-
 # Object code: kept on disk, made again where it is damaged, loaded by any number of processes.
 
 
@@ -186,13 +137,6 @@ def compilations(monkeypatch):
     return seen
 
 
-def test_code_can_be_freed_and_other_code_stays():
-    first, second, third = (ObjectCode(text(x), "put", (ctypes.c_void_p,)) for x in (1.0, 2.0, 3.0))
-    del second
-    gc.collect()
-    assert [stored(1.0, first), stored(3.0, third), stored(4.0)] == [1.0, 3.0, 4.0]
-
-
 @pytest.mark.parametrize("damage", ["empty", "half", "one byte", "longer"])
 def test_damaged_code_is_made_again(damage, folder, compilations):
     stored(1.0)
@@ -211,18 +155,3 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, 
     monkeypatch.setattr(machine_code, "cache_folder", lambda: tmp_path / "file" / "native")
     assert stored(1.0) == stored(1.0) == 1.0
     assert len(compilations) == 2
-
-
-@pytest.mark.parametrize("changed", ["processor", "features", "llvm", "llvmlite"])
-def test_other_processors_and_versions_have_files_of_their_own(changed, folder, monkeypatch):
-    stored(1.0)
-    changes = {
-        "processor": (machine_code.llvm, "get_host_cpu_name", lambda: "x86-64"),
-        "features": (machine_code, "_features", lambda: "-avx512f"),
-        "llvm": (machine_code.llvm, "llvm_version_info", (1, 0, 0)),
-        "llvmlite": (machine_code, "version", lambda name: "0.1"),
-    }
-    monkeypatch.setattr(*changes[changed])
-    monkeypatch.setattr(machine_code, "_compile", lambda text: b"other code")
-    machine_code._compiled(text(1.0))
-    assert len(list(folder.iterdir())) == 2

@@ -61,13 +61,6 @@ def test_the_turbine_observes_by_hand():
     torch.testing.assert_close(plant.observe(TIME_ZERO, state, double(15.5)), expected)
 
 
-def test_the_phase_of_the_wing_beat():
-    plant = FlappingWing(observe=("phase_cosine", "phase_sine"))
-    t = double(0.0, 0.0125, 0.025)  # a beat lasts 0.05 s
-    seen = plant.observe(t, torch.zeros(3, 4, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64))
-    torch.testing.assert_close(seen, double(1.0, 0.0, 0.0, 1.0, -1.0, 0.0).view(3, 2), atol=1e-12, rtol=0.0)
-
-
 def test_a_filter_of_the_position_tells_the_speed_behind_it():
     """Of a ramp, the low-pass lags by 1/ω_F, and its difference from it is the speed: x − x_F → v/ω_F."""
     plant = FlappingWing(observe=("position",))
@@ -82,20 +75,6 @@ def test_a_filter_of_the_position_tells_the_speed_behind_it():
     torch.testing.assert_close(plant.seen_velocity(states[-1:])[0], -seen[2:4])
     start = plant.controller_start(double(0.3, 1.2, 0.0, 0.0), torch.zeros(1).double())
     assert start.tolist() == [0.3, 1.2]
-
-
-def test_a_drone_filters_as_its_log_does():
-    """The states in flight and those that a log completes: trapezoids of a smooth position in 0.5 ms."""
-    plant = FlappingWing(observe=("position",), horizon=0.3)
-    commands = torch.full((1, plant.n_steps, 2), 80.0).double()
-    commands[..., 1] = -5.0
-    start, wind = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded(1))
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure)(start, wind, commands).each()[0]
-    names = [state.name for state in plant.states[:4]]
-    measured = dict(zip(names, flown.states[:, :4].unbind(-1), strict=True))
-    found = plant.complete_states(measured, flown.exogenous, flown.actions)
-    torch.testing.assert_close(found, flown.states, rtol=0.0, atol=1e-6)
 
 
 # Previews

@@ -138,8 +138,8 @@ PLANT = LinearQuadratic(horizon=3.0)
 
 def machine(injections=(), **options):
     """The oracle plant behind a safety layer, with faults, as a real system; the plant itself goes on for long."""
-    system = FaultySystem(PlantEnv(LinearQuadratic(horizon=300.0), seed=0), injections, interval=PLANT.dt)
-    config = SafetyConfig(interval=PLANT.dt, frozen={"state": (5, 0)}, clock="time", **options)
+    system = FaultySystem(PlantEnv(LinearQuadratic(horizon=300.0), seed=0), injections)
+    config = SafetyConfig(interval=PLANT.dt, frozen={"state": (5, 0)}, **options)
     layer = SafetyLayer(system, config, fallback=(0.0,))
     state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
     return RealSystem(layer, PLANT, state=state, exogenous=exogenous, applied=applied, closure=PLANT.closure)

@@ -128,16 +128,3 @@ def test_the_state_of_another_training_is_refused_by_the_name_of_what_does_not_f
     found, other = algorithm(), algorithm(learner=LEARNERS["td3"])
     with pytest.raises(ValueError, match="the saved state of learner does not fit"):
         found.load_state_dict(copy.deepcopy(other.state_dict()))
-
-
-def test_the_belief_predicts_the_cost_of_the_flight_itself():
-    """A twin with the true closure flies the real episodes again at their cost: no exploration, the same inputs."""
-    from rt_torchrl.systems.exploration import ExplorationConfig
-
-    found = twinning(PLANT, closure=copy.deepcopy(PLANT.closure), exploration=ExplorationConfig(episodes=0))
-    flown(found)
-    found.policies["model_free"].load_state_dict({"gain": torch.tensor([[0.9, 1.2]], dtype=torch.float64)})
-    flown(found)
-    real = [one.cost for one in found.belief.flown]
-    assert len(real) == 2 and real[0] != real[1]
-    assert found.belief.differences() == pytest.approx([0.0, 0.0], abs=1e-12)

@@ -7,23 +7,20 @@ import signal
 import pytest
 import torch
 from figure_reading import draw
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from small_runs import SMALL, small_run
+from linear_quadratic import LinearGain, LinearQuadratic
+from small_runs import SMALL
 from test_algorithm import flown, twinning
 from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl.evaluation.unseen import RealController, RealEpisodes, TwinEpisodes
-from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyLayer
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 STEPS = 20
 
@@ -222,28 +219,6 @@ def test_a_system_with_a_known_closure_is_simulated_and_the_table_says_so(tmp_pa
     assert "in simulation, with the closure that the real system was given" in capsys.readouterr().out
 
 
-def test_a_flight_in_which_the_twin_diverges_costs_no_number_and_the_others_do():
-    plant = LinearQuadratic(horizon=2.0)
-    episodes = TwinEpisodes(DigitalTwin(plant, LinearClosure(1e6 * torch.eye(2))), plant, 3)
-    episodes.initial_state[1], episodes.exogenous[1] = 0.0, 0.0
-    policy = LinearGain([[0.5, 0.5]])
-    costs = episodes.control_costs(policy)
-    assert costs.isfinite().tolist() == [False, True, False] and costs[1] == 0.0
-    assert torch.equal(episodes.judge(episodes.fly(policy)).control_costs.isfinite(), costs.isfinite())
-
-
-def test_flights_are_those_of_the_hypothesis_that_is_believed():
-    plant, lagged = LinearQuadratic(horizon=2.0), LaggedActuator(LinearQuadratic(horizon=2.0), "force", 0.4)
-    laws = LinearClosure(plant.true_closure), lagged.closure
-    twin = TwinEnsemble(plant, laws[0], {"lag": lagged}, {"lag": laws[1]})
-    policy, episodes = LinearGain([[0.5, 0.5]]), TwinEpisodes(twin, plant, 3)
-    for weights, physics in ({"as the twin": 1.0}, plant), ({"lag": 1.0}, lagged):
-        twin.weights = weights
-        act = lambda t, s, z: policy(physics.observe(t, s, z))  # noqa: B023, E731
-        expected = costs_by_hand(physics, physics.closure, episodes, act)
-        torch.testing.assert_close(episodes.control_costs(policy), expected.detach(), rtol=1e-9, atol=0.0)
-
-
 # Real episodes of the algorithm: one reset each, what the system draws, who steps it, and what a failure leaves.
 
 
@@ -298,49 +273,3 @@ def test_episodes_of_a_simulation_are_every_second_draw_of_its_seed(guarded):
             state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
         record = found.short_term[-1]
         assert torch.equal(record.states[0], state[0]) and torch.equal(record.exogenous, exogenous[0])
-
-
-class Ends(PlantEnv):
-    """Falls over after seven intervals."""
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        over = torch.full((1, 1), int(self._step_count) == 7)
-        return found.update({"terminated": over, "done": found["done"] | over})
-
-
-def test_an_environment_that_terminates_is_refused_with_what_to_do():
-    plant = LinearQuadratic(horizon=HORIZON)
-    message = "terminated the episode after 7 of 20 control intervals .* at most 0.7 s"
-    found = twinning(env=Ends(plant))
-    with pytest.raises(ValueError, match=message):
-        found.episode()
-    assert not len(found.learner.memory) and not found.short_term
-    found = twinning(env=connected(plant, rig=Rig(plant, ends_after=7, terminates=True)))
-    with pytest.raises(ValueError, match=message):
-        found.episode()
-
-
-class Blind(PlantEnv):
-    """A system that reports NaN from its fourth interval on."""
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        return found.set("observation", found["observation"] * torch.nan) if self._step_count >= 4 else found
-
-
-# Nothing is flown twice.
-
-
-def test_policies_of_equal_weights_are_flown_once(tmp_path, monkeypatch):
-    """An unseen episode of a real system may take hours."""
-    run, flown = small_run(tmp_path, episodes=1), []
-    for name in ("fly", "control_costs"):
-        call = getattr(run.unseen, name)
-        monkeypatch.setattr(run.unseen, name, lambda policy, call=call: flown.append(policy) or call(policy))
-    run.train()
-    policies = [*run.initial_policies.values(), *run.algorithm.policies.values()]
-    # The model-free policy starts as a clone of the model-based one.
-    distinct = {tuple(parameters_to_vector(policy.parameters()).tolist()) for policy in policies}
-    assert len(distinct) == 3
-    assert sorted(tuple(parameters_to_vector(policy.parameters()).tolist()) for policy in flown) == sorted(distinct)

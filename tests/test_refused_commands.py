@@ -2,23 +2,19 @@
 
 import asyncio
 import contextlib
-import re
 import struct
 from functools import partial
 
 import pytest
 import torch
-from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from served_plants import free_port, in_a_thread
-from test_algorithm import twinning
 from test_real_system import connected
-from test_safety import Clock, Failing, failing, fly, layer
+from test_safety import failing
 from test_served import ENTRIES, PLANT, Line, Time
 from test_served import connected as client_of
 
 from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, Register, SafetyConfig, SafetyLayer
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.machine.connected_plant import LateAnswerError, LinkLostError, RefusedRequestError
 from rt_torchrl.systems.real_system import Actuation
 from rt_torchrl.systems.sound_part import sound_part
@@ -303,52 +299,7 @@ def test_the_first_action_after_a_reset_moves_at_the_rate_from_what_the_machine_
     layer.close()
 
 
-# Readings that the watchdog refuses: their names, the episodes that are not learned from, and the next episode.
-
-
-NAN = float("nan")
 RANGES = {"ranges": {"observation": (-50.0, 50.0)}}
-
-
-class Spiky(Failing):
-    """A system with a value that is off in its fourth observation, in the first episodes only."""
-
-    def __init__(self, plant, value, episodes):
-        super().__init__(plant, Clock(), broken=[3], value=value)
-        self.left = episodes
-
-    def _step(self, tensordict):
-        broken, self.broken = self.broken, self.broken if self.left else set()
-        found, self.broken = super()._step(tensordict), broken
-        self.left -= int(self._step_count) == self.plant.n_steps and self.left > 0
-        return found
-
-
-def stored(found):
-    """Everything that both memories hold, in one vector."""
-    record, replay = found.short_term[-1], found.learner.memory.buffer[:]
-    entries = [replay[key] for key in ("observation", "action", ("next", "observation"), ("next", "reward"))]
-    return torch.cat([tensor.flatten() for tensor in (*entries, record.states, record.actions, record.exogenous)])
-
-
-@pytest.mark.parametrize(
-    ("value", "options", "reason"),
-    [
-        (1e5, RANGES, "refused 1 of its readings, the first at the end of interval 3"),
-        (NAN, {}, "refused 1 of its readings, the first at the end of interval 3"),
-        (1e300, {}, r"observation holds 1e\+300 in interval 4"),
-    ],
-)
-def test_an_episode_with_a_refused_reading_is_flown_again(value, options, reason):
-    plant = LinearQuadratic(horizon=2.0)
-    found = twinning(env=layer(Spiky(plant, value, episodes=2), **options))
-    report = found.episode()
-    assert report["episodes_refused"] == 2
-    assert re.search(reason, report["refusal"])
-    assert len(found.learner.memory) == 20 and len(found.short_term) == 1
-    # Of this plant under these policies nothing comes near to fifty.
-    assert stored(found).abs().max() < 50.0 and report["real_cost"] < 50.0
-    assert "episodes_refused" not in found.episode()
 
 
 def test_a_real_system_passes_the_refusals_of_its_layer_on():
@@ -359,38 +310,3 @@ def test_a_real_system_passes_the_refusals_of_its_layer_on():
     episode = system.rollout(20)
     assert episode["next", "refused"].flatten().nonzero().flatten().tolist() == [3, 4]
     assert "refused" not in connected(plant).observation_spec
-
-
-class Worthless(PlantEnv):
-    """A system whose own reward is NaN."""
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        return found.set("reward", found["reward"] * NAN)
-
-
-def test_a_reward_is_no_reading():
-    """A bad reward trips nothing: a real system does not use it, and where it is used the episode is refused."""
-    plant = LinearQuadratic(horizon=2.0)
-    env = layer(Worthless(plant))
-    assert fly(env, [0.5] * 20)["next", "applied"].eq(0.5).all() and not env.report.events
-    with pytest.raises(ValueError, match=r"3 real episodes in a row .*\('next', 'reward'\) holds nan"):
-        twinning(env=env).episode()
-
-
-def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
-    plant, dropped = LinearQuadratic(horizon=2.0), Injection("dropped", 2, 19, episode=0)
-    env = layer(FaultySystem(PlantEnv(plant), [dropped], interval=plant.dt))
-    episode = fly(env, [0.5] * 20)
-    assert episode["next", "refused"].flatten().nonzero().flatten().tolist() == list(range(2, 20))
-    assert (episode["next", "state"][0, 2:] == episode["next", "state"][0, 1]).all()
-    assert env.report.counts["missing"] == 18 and "state" in env.report.events[0].reasons["missing"]
-
-
-def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():
-    found = twinning()
-    for weight in found.learner.critic_adam.weights:
-        weight.data.fill_(NAN)
-    with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
-        found.episode()
-    assert not len(found.learner.memory)

@@ -4,21 +4,18 @@ import json
 import math
 from pathlib import Path
 
-import gymnasium
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import GymEnv, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
+from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, layer_of
 from rt_torchrl.systems.sound_part import report_of
 
@@ -196,22 +193,6 @@ def test_specs_hold_around_both_kinds_of_systems():
     check_env_specs(layer(GymEnv("Pendulum-v1"), rates=(10.0,)))
 
 
-def test_a_gymnasium_system_is_guarded_in_its_own_precision():
-    pytest.importorskip("gymnasium")
-    limits = {"rates": (8.0,), "ranges": {"observation": (-2.0, 2.0)}, "hold": 0.0}
-    env = SafetyLayer(GymEnv("Pendulum-v1"), SafetyConfig(interval=0.05, **limits), fallback=(0.0,))
-    env.set_seed(0)
-    torch.manual_seed(0)
-    episode = env.rollout(200, break_when_any_done=False)
-    sent = episode["next", "applied"]
-    assert sent.dtype == torch.float32 and sent.abs().max() <= 2.0
-    # Single precision of numbers up to two.
-    assert sent.diff(dim=0).abs().max() <= 0.4 + 1e-6
-    fast = (episode["next", "observation"].abs() > 2.0).any(-1)
-    assert torch.equal(fast, episode["next", "tripped"].flatten())
-    assert env.report.counts["out of range"] == fast.sum() > 0
-
-
 def test_what_the_layer_does_not_have_is_the_systems():
     env = layer()
     assert isinstance(env.plant, LinearQuadratic) and env.closure is env.plant.closure
@@ -248,74 +229,6 @@ def test_what_cannot_be_guarded_is_refused():
     pytest.importorskip("gymnasium")
     with pytest.raises(ValueError, match="continuous entry"):
         layer(GymEnv("CartPole-v1"))
-
-
-# A safety layer in front of a machine, and the machine with it as a real system: Gymnasium's pendulum.
-
-
-RATE = 5.0
-APPLIED = Reading(keys=("applied",), scale=2.0)
-
-
-class InShares(gymnasium.ActionWrapper):
-    """The pendulum's torque as a share of its greatest, as a drive may want it; the plant counts in N m."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
-
-    def action(self, action):
-        return 2.0 * action
-
-
-class FailingMachine(gymnasium.ObservationWrapper):
-    """A system that reports NaN at one step."""
-
-    def __init__(self, env, broken):
-        super().__init__(env)
-        self.broken, self.count = broken, -1
-
-    def reset(self, **options):
-        self.count = -1
-        return super().reset(**options)
-
-    def observation(self, observation):
-        self.count += 1
-        return observation * float("nan") if self.count == self.broken else observation
-
-
-def guarded(plant, broken, **options):
-    """The machine behind its layer, whose limits and fallback are in the machine's own units."""
-    machine = FailingMachine(InShares(gymnasium.make("Pendulum-v1", max_episode_steps=plant.n_steps)), broken)
-    config = SafetyConfig(interval=plant.dt, rates=(RATE / 2.0,), **options)
-    return SafetyLayer(GymWrapper(machine), config, fallback=(0.0,))
-
-
-def real(layer, plant, **options):
-    reading = Reading(of=angle_and_speed)
-    return RealSystem(layer, plant, state=reading, actuation=Actuation(scale=2.0), seed=0, **options)
-
-
-def test_what_was_applied_is_what_the_twin_replays():
-    """A policy that asks for more than the rate allows, and a fault: the record still follows the plant's own step."""
-    plant = Pendulum(horizon=3.0)
-    layer = guarded(plant, broken=20, hold=0.5)
-    system = real(layer, plant, applied=APPLIED)
-    asked = iter([RATE * plant.dt] + [-2.0, 2.0] * plant.n_steps)
-    flown = system.rollout(plant.n_steps, lambda td: td.set("action", torch.full((1, 1), next(asked)).double()))[0]
-    applied, action = flown["next", "applied"], flown["action"]
-    assert not torch.allclose(applied, action)
-    assert (applied.diff(dim=0).abs() <= RATE * plant.dt + 1e-6).all()
-    # Tripped for half a second from the fault on; the fallback is reached at the rate that holds for it too.
-    assert layer.report.counts["fallback"] == 10 and (applied[24:29] == 0.0).all()
-    t, nothing = torch.zeros(plant.n_steps).double(), torch.zeros(plant.n_steps, 0).double()
-    ends = plant.step(t, flown["state"], applied, nothing, plant.closure).state
-    there = torch.ones(plant.n_steps, dtype=torch.bool)
-    there[19:21] = False  # the observation that was lost, as its end and as the next start
-    difference = (ends - flown["next", "state"])[there]
-    wrapped = torch.remainder(difference[:, 0] + torch.pi, 2.0 * torch.pi) - torch.pi
-    # Gymnasium reports in single precision.
-    assert wrapped.abs().max() < 1e-5 and difference[:, 1].abs().max() < 1e-4
 
 
 # Closing what stands around a machine closes the machine, once.

@@ -30,13 +30,9 @@ class SafetyConfig:
             components or one number for each component.
         limits: range (low, high) of entries of the observation in which the system is to stay, as ``ranges``. Beyond it
             the fallback acts, and the reading is learned from.
-        clock: entry of the observation that holds the system's clock [s], where it has one. A sample that comes twice
-            or is left out, and a clock that jumps, show in it by more than half an interval.
         frozen: entries of the observation whose components always move, by name, each with the number of equal readings
             in a row that count as a frozen sensor: one number for all components, or one for each, where 0 does not
             watch a component.
-        following: greatest difference between the action sent and the one that the system reports as ``applied``, for
-            each action; beyond it an event says that the actuator does not follow. None does not compare them.
         deadline: longest wall-clock time from an action to the observation of its effect [s].
         hold: time without a fault after which the policy acts again [s]; with infinity it does not act again in the
             same episode.
@@ -52,9 +48,7 @@ class SafetyConfig:
     rates: tuple[Unbounded, ...] | None = None
     ranges: Mapping[str, Range] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
-    clock: str | None = None
     frozen: Mapping[str, Count] = field(default_factory=dict)
-    following: tuple[Unbounded, ...] | None = None
     deadline: Limit = math.inf
     hold: Duration = 0.0
     log: File | None = None

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from rt_torchrl.options import other_units, require_number
+from rt_torchrl.options import require_number
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -293,21 +293,3 @@ def layers(env: EnvBase) -> Iterator[EnvBase]:
 def innermost(env: EnvBase) -> EnvBase:
     """The system within everything that stands around it."""
     return next(layer for layer in layers(env) if not isinstance(layer, AroundSystem))
-
-
-def require_interval(env: EnvBase, interval: float) -> None:
-    """Refuse a control interval that is not that of a simulation.
-
-    Args:
-        env: the system; of a machine nothing is known.
-        interval: control interval [s].
-
-    Raises:
-        ValueError: if the simulated plant has another one.
-    """
-    plant = getattr(innermost(env), "plant", None)
-    if isinstance(plant, Plant) and not abs(interval - plant.dt) <= 1e-9 * plant.dt:
-        raise ValueError(
-            f"interval={interval} s must be the control interval of plant {plant.name!r}, {plant.dt:g} s; check its "
-            f"unit: {other_units('s')}."
-        )

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
@@ -31,6 +32,7 @@ from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.sound_part import sound_part
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -199,13 +201,18 @@ def check_real_system(
 
 def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
     """The same of a flight that has been flown, such as the first one of a training."""
+    return _checked(_rows(record, plant, ROWS), plant, closure)
+
+
+def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
+    """At most so many intervals of a record."""
     n = len(record.actions)
-    rows = torch.linspace(0, n - 1, min(n, ROWS)).long()
+    rows = torch.linspace(0, n - 1, min(n, count)).long()
     before = (rows - 1).clamp(min=0)
     t = float(record.start) + plant.dt * rows.double()
     states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
     now, earlier = (actions[rows], exogenous[rows]), (actions[before], exogenous[before])
-    return _checked(Flown(t, states[rows], *now, states[rows + 1], *earlier), plant, closure)
+    return Flown(t, states[rows], *now, states[rows + 1], *earlier)
 
 
 def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
@@ -316,26 +323,26 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
     """The sound intervals of a few short flights."""
     noise = ExplorationConfig(spread=spread, correlation_time=CORRELATION * plant.dt)
     live = LivePolicy(plant, policy, noise, generator=generator).to(env.device)
-    rows: list[tuple[Tensor, ...]] = []
+    parts: list[Flown] = []
     kept = env.state_dict()
     try:
         for _ in range(STARTS):
-            row, earlier = env.reset(), None
+            row, rows = env.reset(), list[TensorDictBase]()
             live.begin(policy, strength=1.0)
-            for k in range(min(INTERVALS, plant.n_steps)):
-                row = env.step(row.set("action", live(row["observation"], row["state"], row["exogenous"])))
-                after, t = row["next"], row["state"].new_full((1,), k * plant.dt)
-                now = after["applied"].clone(), row["exogenous"].clone()
-                if not any("refused" in reading and reading["refused"].any() for reading in (row, after)):
-                    rows.append((t, row["state"].clone(), *now, after["state"].clone(), *(earlier or now)))
-                if after["done"].any():
-                    break
-                row, earlier = env.step_mdp(row), now
+            while len(rows) < min(INTERVALS, plant.n_steps) and not row["done"].any():
+                rows.append(env.step(row.set("action", live(row["observation"], row["state"], row["exogenous"]))))
+                row = env.step_mdp(rows[-1])
+            episode = torch.stack(rows, 1)[0].cpu()
+            for first, last in sound_part(episode, plant, None).parts:
+                part = episode[first:last]
+                states = torch.cat([part["state"], part["next", "state"][-1:]])
+                record = Trajectory(states, part["next", "applied"], part["exogenous"], first * plant.dt)
+                parts.append(_rows(record, plant, INTERVALS))
     finally:
         env.load_state_dict(kept)
-    if not rows:
+    if not parts:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    return Flown._make([*(torch.cat(parts).cpu() for parts in zip(*rows, strict=True)), 1.0, 1.0])
+    return Flown._make([*(torch.cat(columns) for columns in list(zip(*parts, strict=True))[:7]), 1.0, 1.0])
 
 
 def _movement(plant: Plant, flown: Flown) -> Float[Tensor, "n n_s"]:
@@ -395,19 +402,16 @@ class _Fit:
         from scipy.optimize import least_squares  # here, because it takes a second to load
 
         size, moves = self.movement(flown)
-        latest: dict[str, Tensor] = {}
+        slopes: dict[bytes, Tensor] = {}
 
         def residuals(weights: np.ndarray) -> np.ndarray:
-            error, latest["slopes"] = self._errors(flown, torch.as_tensor(weights))
-            latest["weights"] = torch.as_tensor(weights).clone()
+            error, slopes[weights.tobytes()] = self._errors(flown, torch.as_tensor(weights))
             error = (error / size)[:, moves].flatten()
             return error.nan_to_num(LARGE, LARGE, -LARGE).clamp(-LARGE, LARGE).numpy()
 
         def jacobian(weights: np.ndarray) -> np.ndarray:
-            if not np.array_equal(latest["weights"].numpy(), weights):
-                residuals(weights)
-            slopes = -(latest["slopes"] / size[:, None])[:, moves]
-            return slopes.flatten(0, 1).nan_to_num(0.0, 0.0, 0.0).numpy()
+            change = -(slopes[weights.tobytes()] / size[:, None])[:, moves]
+            return change.flatten(0, 1).nan_to_num(0.0, 0.0, 0.0).numpy()
 
         best = least_squares(residuals, self._guess.numpy(), jac=jacobian, max_nfev=EVALUATIONS)
         return torch.as_tensor(best.x)

@@ -16,17 +16,15 @@ from torchrl.data import Binary, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.atomic_file import finite
-from rt_torchrl.options import array_of, require_range
+from rt_torchrl.options import array_of, other_units, require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
-from rt_torchrl.systems.environment import AroundSystem, innermost, layers, require_interval
+from rt_torchrl.systems.environment import AroundSystem, innermost, layers
 from rt_torchrl.trajectories.trajectory import Trajectory
 
-WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
+WRONG = frozenset({"missing", "not finite", "out of range", "frozen"})
 """Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
-TOLERANCE = 0.5
-"""Share of an interval by which the system's clock may miss it."""
 ROUNDING = 1e-9
 """Slack in comparisons of times that are sums of intervals [s], and share of a rate by which rounding may exceed it."""
 
@@ -39,8 +37,8 @@ class SafetyEvent(NamedTuple):
 
     ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
     policy's action was not finite, and ``fallback`` that the fallback acted. ``missing``, ``not finite``, ``out of
-    range``, ``frozen``, ``clock`` and ``late`` are faults of the observation at the end of the interval. ``limit`` says
-    that the system has left its limits, and ``actuator`` that an actuator does not follow.
+    range``, ``frozen`` and ``late`` are faults of the observation at the end of the interval. ``limit`` says that the
+    system has left its limits.
     """
 
     episode: int
@@ -132,11 +130,10 @@ class ActionLimits:
 
 
 class Watchdog:
-    """Judges the observations of a real system: are they finite, within their ranges, in order and in time?
+    """Judges the observations of a real system: are they finite, within their ranges, and in time?
 
-    A watchdog trips at a fault and stays tripped until it has seen no fault for the hold time. A sample that comes
-    twice, or is left out, shows in the system's clock. The clock may also jump and go on from there; then one interval
-    is wrong. A sensor that is frozen repeats its value.
+    A watchdog trips at a fault and stays tripped until it has seen no fault for the hold time. A sensor that is frozen
+    repeats its value.
 
     The attribute ``stale`` holds the number of readings before the present one that are wrong too, because a sensor was
     frozen before that could be known.
@@ -147,14 +144,12 @@ class Watchdog:
 
     def __init__(self, config: SafetyConfig):
         self.config = config
-        self._tolerance = TOLERANCE * config.interval
         self.begin()
 
     def begin(self) -> None:
         """Begin a new episode, in which nothing has been read and no fault has been seen."""
         self._until = -math.inf
-        self._sound = self._last = -math.inf  # the clock at the last sound reading, and at the last reading
-        self._intervals, self.stale = 0, 0  # since the last sound reading of the clock
+        self.stale = 0
         self._values: dict[str, tuple[Tensor, Tensor]] = {}
 
     def faults(self, entries: Mapping[str, Tensor], elapsed: float) -> dict[str, str]:
@@ -172,8 +167,6 @@ class Watchdog:
             outside = [name for name, ends in ranges.items() if name in entries and not _inside(entries[name], ends)]
             if outside:
                 faults[kind] = ", ".join(outside)
-        if self.config.clock is not None and (wrong := self._clock_fault(entries.get(self.config.clock))):
-            faults["clock"] = wrong
         self.stale = 0
         for entry, limit in self.config.frozen.items():
             count = self._equal(entry, entries[entry], torch.as_tensor(limit)) if entry in entries else 0
@@ -183,20 +176,6 @@ class Watchdog:
         if elapsed > self.config.deadline:
             faults["late"] = f"{elapsed:.6g} s, deadline {self.config.deadline:g} s"
         return faults
-
-    def _clock_fault(self, value: Tensor | None) -> str | None:
-        """What is wrong with the clock; a step is right if it fits the last sound reading or the last one of all."""
-        self._intervals += 1
-        now = math.nan if value is None else float(value.flatten()[0])
-        if not math.isfinite(now):
-            self._last = -math.inf
-            return None
-        interval, last, self._last = self.config.interval, self._last, now
-        steps = (now - self._sound - self._intervals * interval, now - last - interval)
-        if math.isfinite(self._sound) and not any(abs(step) <= self._tolerance for step in steps):
-            return f"{now - max(last, self._sound):.6g} s after the last reading, interval {interval:g} s"
-        self._sound, self._intervals = now, 0
-        return None
 
     def _equal(self, entry: str, value: Tensor, limit: Tensor) -> int:
         """Number of equal readings in a row, with this one, of the component frozen for longest; 0 if none is."""
@@ -266,7 +245,12 @@ class SafetyLayer(AroundSystem):
                 f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
                 "continuous entry 'action'."
             )
-        require_interval(env, config.interval)
+        plant = getattr(innermost(env), "plant", None)
+        if isinstance(plant, Plant) and not abs(config.interval - plant.dt) <= ROUNDING * plant.dt:
+            raise ValueError(
+                f"interval={config.interval} s must be the control interval of plant {plant.name!r}, {plant.dt:g} s; "
+                f"check its unit: {other_units('s')}."
+            )
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config, self._clock = env, config, clock
         self.report, self._episodes = SafetyReport(), 0
@@ -275,7 +259,6 @@ class SafetyLayer(AroundSystem):
         self._unwritten: OSError | None = None
         self._make_specs()
         self.watchdog, self.limits = Watchdog(config), ActionLimits(env.action_spec, config)
-        self._following = None if config.following is None else self.limits.constant("following", config.following)
         self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
@@ -283,10 +266,8 @@ class SafetyLayer(AroundSystem):
 
     def _make_specs(self) -> None:
         observation, action = self.env.full_observation_spec.clone(), self.env.action_spec
-        clock = [] if self.config.clock is None else [self.config.clock]
-        named = {name: getattr(self.config, name) for name in ("ranges", "limits", "frozen")} | {"clock": clock}
-        for argument, entries in named.items():
-            unknown = set(entries) - set(observation.keys())
+        for argument in ("ranges", "limits", "frozen"):
+            unknown = set(getattr(self.config, argument)) - set(observation.keys())
             if unknown:
                 raise ValueError(f"{argument} has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
         if "applied" not in observation:
@@ -345,8 +326,7 @@ class SafetyLayer(AroundSystem):
         if reading["refused"].any():
             first = max(0, self._step_count - self.watchdog.stale)
             self.report.wrong.update(range(first, self._step_count + 1))
-        reasons |= faults | self._not_followed(applied, reading["applied"])
-        self._note(reasons, tensordict["action"], applied)
+        self._note(reasons | faults, tensordict["action"], applied)
         self._last, self._step_count = applied, self._step_count + 1
         return reading
 
@@ -379,13 +359,6 @@ class SafetyLayer(AroundSystem):
         if reasons and "not finite" in faults:
             faults["not finite"] += f" ({'; '.join(f'{tag}: {why}' for tag, why in reasons.items())})"
         return faults
-
-    def _not_followed(self, sent: Tensor, applied: Tensor) -> dict[str, str]:
-        """Actuators that do not do what was sent; the record holds what they have done instead."""
-        if self._following is None:
-            return {}
-        behind = (applied - sent).abs() > self._following
-        return {"actuator": _components(behind)} if behind.any() else {}
 
     def _remember(self, reading: TensorDictBase) -> TensorDictBase:
         """Replace values that are missing or not finite by the last finite ones."""
@@ -429,32 +402,23 @@ class OperatingLimits:
         config: the limits.
 
     Raises:
-        ValueError: if the plant has no such state or action, a limit lies beyond the signal's own range, where it would
-            limit nothing, or the limits leave no action of its range.
+        ValueError: if the plant has no such state or action, or a limit lies beyond the signal's own range, where it
+            would limit nothing.
     """
 
     def __init__(self, plant: Plant, config: OperatingLimitsConfig):
         self.config, self._dt, self._read = config, plant.dt, len(plant.readings)
-        self.states = _ends_of("states", plant.readings, config.states)
-        self.actions = _ends_of("actions", plant.actions, config.actions)
-        for action, low, high in zip(plant.actions, *self.actions, strict=True):
-            if not max(low, action.low) < min(high, action.high):
-                raise ValueError(
-                    f"limits.actions {action.name}={low:g} to {high:g} leave nothing of the action's range "
-                    f"{action.low:g} to {action.high:g} {action.unit}."
-                )
-        _require_known("rates", plant.actions, config.rates)
-        for what, signals in (("states", plant.readings), ("actions", plant.actions)):
-            for signal in signals:
-                for end in filter(math.isfinite, getattr(config, what).get(signal.name, ())):
-                    name = f"limits.{what} {signal.name}"
-                    require_range(name, end, signal.low, signal.high, unit=signal.unit, of="the plant")
-        for action in plant.actions:
-            if action.name in config.rates:
-                # A greater rate than that of the whole range in an interval limits nothing.
-                greatest, unit = (action.high - action.low) / plant.dt, f"{action.unit}/s"
-                name = f"limits.rates {action.name}"
-                require_range(name, config.rates[action.name], 0.0, greatest, unit=unit, of="the plant")
+        for what, signals in (("states", plant.readings), ("actions", plant.actions), ("rates", plant.actions)):
+            given, known = getattr(config, what), {signal.name: signal for signal in signals}
+            if unknown := sorted(set(given) - set(known)):
+                raise ValueError(f"limits.{what} has {', '.join(unknown)}; the plant has {', '.join(known)}.")
+            for name, ends in given.items():
+                low, high, unit = known[name].low, known[name].high, known[name].unit
+                if what == "rates":  # a greater rate than that of the whole range in an interval limits nothing
+                    ends, low, high, unit = (ends,), 0.0, (high - low) / plant.dt, f"{unit}/s"
+                for end in filter(math.isfinite, ends):
+                    require_range(f"limits.{what} {name}", end, low, high, unit=unit, of="the plant")
+        self.states, self.actions = _ends(plant.readings, config.states), _ends(plant.actions, config.actions)
         self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
 
     def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
@@ -503,15 +467,7 @@ def _outside(values: Tensor, ends: Ends) -> Bool[Tensor, "*batch n"]:
     return ~((values >= low) & (values <= high)).all(-1)
 
 
-def _ends_of(what: str, signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:
-    _require_known(what, signals, given)
+def _ends(signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:
     free = (-math.inf, math.inf)
     low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
     return low, high
-
-
-def _require_known(what: str, signals: tuple[Signal, ...], given: Mapping[str, Any]) -> None:
-    names = [signal.name for signal in signals]
-    unknown = sorted(set(given) - set(names))
-    if unknown:
-        raise ValueError(f"limits.{what} has {', '.join(unknown)}; the plant has {', '.join(names)}.")

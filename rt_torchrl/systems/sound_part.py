@@ -21,7 +21,7 @@ SHORTEST = 10
 """Least number of control intervals of a part that is learned from."""
 LEARNED = ("state", "exogenous", "observation", *(("next", k) for k in ("state", "observation", "applied", "reward")))
 """Entries of an episode that go into a memory."""
-FAULTS = ("missing", "not finite", "out of range", "frozen", "clock", "late", "limit", "actuator", "asked")
+FAULTS = ("missing", "not finite", "out of range", "frozen", "late", "limit", "asked")
 """Reasons of a safety layer's events that are faults of the system, or of a policy that asks for no number."""
 
 
