@@ -17,7 +17,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds, differences
+from rt_torchrl.systems.collectors import together
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.sound_part import sound_part
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -332,7 +333,7 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
             while len(rows) < min(INTERVALS, plant.n_steps) and not row["done"].any():
                 rows.append(env.step(row.set("action", live(row["observation"], row["state"], row["exogenous"]))))
                 row = env.step_mdp(rows[-1])
-            episode = torch.stack(rows, 1)[0].cpu()
+            episode = cast(TensorDictBase, together(rows))[0].cpu()
             for first, last in sound_part(episode, plant, None).parts:
                 part = episode[first:last]
                 states = torch.cat([part["state"], part["next", "state"][-1:]])
