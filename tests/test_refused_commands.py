@@ -160,8 +160,8 @@ def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error
         row = act(system, row, 0.5)
         rows.append(row)
         row = system.step_mdp(row)
-        if client._mender is not None:
-            client._mender.join()
+        if client._connecting is not None:
+            client._connecting.exception()
     found = sound_part(torch.stack(rows, 1)[0], PLANT, layer.report)
     assert found.parts == [(0, 5), (7, PLANT.n_steps)]
     (said,) = [event.reasons["not finite"] for event in layer.report.events if event.step == 5]
@@ -198,8 +198,7 @@ def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_ne
     env = client_of(line)
     row, action = env.reset(), torch.tensor([1.0]).double()
     row = env.step(row.set("action", action))["next"]
-    if env._mender is not None:
-        env._mender.join()
+    env._connecting.exception()
     with pytest.raises(KeyError, match=r"cert\.pem"):
         env.step(row.set("action", action))
     row = env.reset()

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import threading
 import time
 from collections import Counter
 
@@ -120,8 +119,8 @@ def test_a_client_keeps_its_period_while_the_line_is_down_and_goes_on_afterwards
         row = env.step(row.set("action", torch.tensor([1.0]).double()))["next"]
         lost.append(bool(row["state"].isnan().any()))
         times.append(line.time.now)
-        if env._mender is not None and line.time.now >= 1.85:
-            env._mender.join()
+        if env._connecting is not None and line.time.now >= 1.85:
+            env._connecting.exception()
     assert env.losses == 1 and 8 <= sum(lost) <= 10 and lost.index(True) in (9, 10) and not any(lost[22:])
     # The period is kept: no step takes longer than one and a half of it, for the first look after the loss.
     assert max(b - a for a, b in zip(times, times[1:], strict=False)) <= 0.15 + 1e-9
@@ -273,53 +272,6 @@ def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol, 
         # end: two periods, and half of one for a server that shares its core with the test.
         assert course.times[safe[0]] - moment <= 2.5 * PERIOD
         assert {course.applied[k] for k in inside} <= {SAFE, ASKED}
-
-
-class Brittle:
-    """A link on which the first writes after each of some connections fail."""
-
-    def __init__(self, failures):
-        self.failures, self.connections, self.sample = failures, 0, 0.0
-
-    def connect(self):
-        self.connections += 1
-
-    def read(self):
-        self.sample += 1.0
-        return {"speed": 1.0, "sample": self.sample}
-
-    def write(self, values):
-        if self.connections <= self.failures:
-            raise LinkLostError("cut")
-
-    def close(self):
-        pass
-
-
-class Slow(ConnectedPlant):
-    """A client whose mender takes a while from its new connection to its end."""
-
-    @property
-    def _connected(self):
-        return self.__dict__.get("up", False)
-
-    @_connected.setter
-    def _connected(self, value):
-        self.__dict__["up"] = value
-        if value and threading.current_thread() is not threading.main_thread():
-            time.sleep(0.1)
-
-
-def test_a_loss_right_after_a_new_connection_is_mended_too():
-    link = Brittle(failures=2)
-    env = Slow(link, {"state": ("speed",)}, ("force",), ENDLESS.actions, period=0.01, sample="sample")
-    row = env.reset()
-    for _ in range(100):
-        row = env.step(row.set("action", torch.tensor([ASKED]).double()))["next"]
-        if link.connections > 2 and row["state"].isfinite().all():
-            break
-    assert row["state"].tolist() == [1.0] and (link.connections, env.losses) == (3, 2)
-    env.close()
 
 
 # The recipe of the served turbine, in small.

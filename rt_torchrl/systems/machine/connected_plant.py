@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -162,19 +163,14 @@ class ConnectedPlant(ForeignSystem):
         self._sample, self._connected, self._closing = -math.inf, False, False
         self.reasons: dict[str, str] = {}
         self._lost = ""  # why the last request failed
-        self._refused: Exception | None = None  # what the plant has refused, or the link has failed at, beside the loop
-        self._mender: threading.Thread | None = None
-        self._lock = threading.Lock()  # connection and mender change together
+        self._connecting: Future[None] | None = None  # attempts to connect again, beside the control loop
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Connect, if there is no connection, and wait for a sample."""
         until = self._clock() + self._patience
         while self._clock() < until:
-            self._require_not_refused()
             try:
-                with self._lock:
-                    idle = not self._connected and self._mender is None
-                if idle:
+                if not self._up() and self._connecting is None:
                     self.link.connect()
                     self._connected = True
                 self.pace.begin()
@@ -187,18 +183,19 @@ class ConnectedPlant(ForeignSystem):
         why = f": {self._lost}" if self._lost else ""
         raise ValueError(f"the plant has not answered for patience={self._patience:g} s{why}")
 
-    def _require_not_refused(self) -> None:
-        """Raise in the control loop what has ended the attempts to connect beside it."""
-        refused, self._refused = self._refused, None
-        if refused is not None:
-            raise refused
+    def _up(self) -> bool:
+        """Whether there is a connection; what has ended the attempts to connect again is raised here."""
+        if self._connecting is not None and self._connecting.done():
+            connecting, self._connecting = self._connecting, None
+            connecting.result()
+            self._connected = True
+        return self._connected
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         values = dict(zip(self._commands, tensordict["action"].reshape(-1).tolist(), strict=True))
         if self._answered is not None:
             values[self._answered] = self._sample
-        self._require_not_refused()
-        through = self._connected and self._written(values)
+        through = self._up() and self._written(values)
         self.pace.wait()
         reading = self._fresh() if self._connected else None
         if not through:
@@ -274,34 +271,28 @@ class ConnectedPlant(ForeignSystem):
                 return
         self._in_a_row = 0
         self.losses += 1
-        with self._lock:
-            self._connected = False
-            if self._mender is None:
-                self._mender = threading.Thread(target=self._mend, daemon=True)
-                self._mender.start()
+        self._connected, self._connecting = False, Future()
+        threading.Thread(target=self._connect, args=(self._connecting,), daemon=True).start()
 
-    def _mend(self) -> None:
-        connected = False
-        while not connected and not self._closing:
-            try:
-                self.link.connect()
-                connected = True
-            except LinkLostError as error:
-                self._lost = str(error)
-                time.sleep(AGAIN)
-            except Exception as error:  # what the plant refuses, or an error of the link: the control loop raises it
-                self._refused = error
-                break
-        # Together: a loss right after a new connection finds no mender, and starts the next one.
-        with self._lock:
-            self._connected, self._mender = connected, None
+    def _connect(self, done: "Future[None]") -> None:
+        """Try until there is a connection, or the plant refuses, or the link fails otherwise."""
+        try:
+            while not self._closing:
+                try:
+                    self.link.connect()
+                    break
+                except LinkLostError as error:
+                    self._lost = str(error)
+                    time.sleep(AGAIN)
+            done.set_result(None)
+        except Exception as error:  # the control loop raises it
+            done.set_exception(error)
 
     def close(self, **kwargs: Any) -> None:
         """Close the connection; the plant's own watchdog then brings its safe action."""
         self._closing = True
-        mender = self._mender
-        if mender is not None:
-            mender.join()
+        if self._connecting is not None:
+            self._connecting.exception()  # waits
         self.link.close()
-        self._connected = False
+        self._connected, self._connecting = False, None
         super().close(**kwargs)
