@@ -184,7 +184,10 @@ def main(config: Config, **parts: Any) -> None:
     if config.serve:
         print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
         logging.disable(logging.CRITICAL)  # clients that go away are no errors of this process
-        asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
+        try:
+            asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
+        except (OSError, RuntimeError) as error:  # pymodbus raises a RuntimeError if it cannot listen
+            raise ValueError(f"port={config.port} cannot be listened on: {error}") from error
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
     config = dataclasses.replace(config, asynchronous=True, operation=OperationConfig(continuous=True))

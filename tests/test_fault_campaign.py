@@ -11,7 +11,6 @@ import os
 import pickle
 import random
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -207,27 +206,6 @@ def test_after_a_fall_back_the_training_is_the_same_to_the_bit(tmp_path, kept):
     assert deterministic(tmp_path) == deterministic(files[0].parent)
     assert same(*(load_tensors(folder / "weights.pt") for folder in (tmp_path, files[0].parent)))
     assert len(list(tmp_path.glob("*.damaged"))) == 2
-
-
-@pytest.mark.faults
-@pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
-def test_a_file_system_that_is_full_leaves_what_was_done(server, tmp_path, whole, share):
-    """It has a share of the room that the run needs; then there is room, and the run goes on."""
-    undisturbed = whole(None)
-    needs = sum(file.stat().st_size for file in undisturbed[0].rglob("*") if file.is_file()) // 1024
-    mount = ["mount", "-t", "tmpfs", "-o"]
-    if subprocess.run(
-        [*mount, f"size={max(40, int(share * needs))}k", "tmpfs", tmp_path], capture_output=True
-    ).returncode:
-        pytest.skip("a small file system cannot be mounted here")
-    try:
-        started(server, tmp_path).join()
-        done = deterministic(tmp_path) if run_folder.checkpoints(tmp_path) else []
-        assert done == undisturbed[1][: len(done)]
-        subprocess.run([*mount, "remount,size=64m", tmp_path], check=True)
-        require_resumed(server, tmp_path, undisturbed)
-    finally:
-        subprocess.run(["umount", tmp_path], check=True)
 
 
 @pytest.mark.parametrize("room", [0, 10**9], ids=["none", "that of earlier checkpoints"])

@@ -1,7 +1,7 @@
 """The real system of a run: in simulation, operated beside the learning, and flown after the training."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -164,13 +164,6 @@ def end_operation(algorithm: ReinforcementTwinning) -> None:
         algorithm.operating.operation.close()
 
 
-class Contender(NamedTuple):
-    """A controller that is to fly the real system, and what it is called before it does."""
-
-    called: str
-    fly: Callable[[], Trajectory]
-
-
 class RealFlights(NamedTuple):
     """What a controller has flown on the real system after the training, and what that cost."""
 
@@ -186,7 +179,7 @@ def contenders(
     baselines: Mapping[str, Baseline],
     *,
     device: torch.device,
-) -> dict[str, Contender]:
+) -> dict[str, Callable[[], Trajectory]]:
     """The controllers that are to fly the real system after the training, by name.
 
     These are the live policy, unless it still has the random weights that it began with, and the controllers that are
@@ -200,7 +193,7 @@ def contenders(
         baselines: controllers that are judged beside the policies, with the one that the training has begun with.
         device: device of the twin.
     """
-    found: dict[str, Contender] = {}
+    found: dict[str, Callable[[], Trajectory]] = {}
     if not config.real_unseen:
         return found
     asked = RealEpisodes(system, config.real_unseen, device=device)
@@ -208,14 +201,15 @@ def contenders(
     policy = algorithm.policies[live]
     known = config.start != "random" or isinstance(policy, StateFeedback)
     if known or not clones(policy, untrained[live]):
-        found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
-    return found | {name: Contender(name, partial(asked.fly, law)) for name, law in baselines.items()}
+        found[live] = partial(asked.fly, policy)
+    return found | {name: partial(asked.fly, law) for name, law in baselines.items()}
 
 
-def announcement(found: Mapping[str, Contender], count: int) -> str:
+def announcement(names: Iterable[str], live: Role, count: int) -> str:
     """How many flights of whom there will be on the real system, where each controller makes so many."""
-    each = ", ".join(f"{count} of {one.called}" for one in found.values())
-    return f"{count * len(found)} flights on the real system: {each}; they count as paid"
+    called = [f"the live policy ({live.replace('_', '-')})" if name == live else name for name in names]
+    each = ", ".join(f"{count} of {who}" for who in called)
+    return f"{count * len(called)} flights on the real system: {each}; they count as paid"
 
 
 def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:

@@ -338,9 +338,9 @@ class Run:
         if self.config.real_unseen and live not in found:
             bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
         if found:
-            bar.write(real_side.announcement(found, self.config.real_unseen))
+            bar.write(real_side.announcement(found, live, self.config.real_unseen))
             bar.doing("judging on the real system")
-        flown = {name: one.fly() for name, one in found.items()}
+        flown = {name: fly() for name, fly in found.items()}
         return {name: RealFlights(one, self._on_the_real_system(one).judge(one)) for name, one in flown.items()}
 
     def _on_the_real_system(self, flown: Trajectory) -> RealEpisodes:

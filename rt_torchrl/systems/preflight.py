@@ -15,8 +15,7 @@ import copy
 import itertools
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -28,7 +27,6 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import OTHER_UNITS
-from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.systems.collectors import together
@@ -46,8 +44,6 @@ EXPLAINED = 3e-3
 """Share of the movement of a state that a twin with fitted coefficients may leave unexplained without a question."""
 DOUBTFUL = 0.2
 """Share of the movement of a state beyond which a warning names the state."""
-REFITTED = 5.0
-"""Factor between first and fitted value of a coefficient beyond which both are printed."""
 DRAWS, BEYOND = 10, 3.0
 """Drawn courses of the inputs that readings are compared with, and the factor by which readings may leave them."""
 FLOOR = 3e-4
@@ -121,7 +117,6 @@ class Wiring(NamedTuple):
             still where the twin moves, two signals with the same readings, an input far outside its draws; or the
             mistakes that fit much better, the best one first. Empty if the wiring is right or nothing fits.
         doubts: where no mistake is named, the states of whose movement much is unexplained, in words.
-        refitted: where no mistake is named, first and fitted value of each coefficient in which they are far apart.
     """
 
     plant: Plant
@@ -129,7 +124,6 @@ class Wiring(NamedTuple):
     moved: Float[Tensor, " n_s"]
     mistakes: tuple[Suspicion, ...]
     doubts: tuple[str, ...] = ()
-    refitted: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
@@ -147,10 +141,6 @@ class Wiring(NamedTuple):
                 f"  much less is unexplained if {mistake.mistake}: {shares}" if shares else f"  {mistake.mistake}"
             )
         rows += [f"  {doubt}" for doubt in self.doubts]
-        rows += [
-            f"  the fit takes {name} from {first:.4g} to {fitted:.4g}; check units and dt"
-            for name, (first, fitted) in self.refitted.items()
-        ]
         return "\n".join(rows)
 
     def require(self) -> None:
@@ -219,9 +209,8 @@ def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
 def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     plant = copy.deepcopy(plant).cpu()
     fit = _Fit(plant, closure)
-    first = fit.coefficients()
     present, (moved, moves) = fit.suspicion("", flown), fit.movement(flown)
-    fitted, explained = fit.coefficients(), not (present.unexplained > EXPLAINED).any()
+    explained = not (present.unexplained > EXPLAINED).any()
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
     names = [signal.name for signal in plant.states]
     wrong = [
@@ -234,25 +223,13 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
     if not mistakes and not explained:
         mistakes = _better(present, fit, flown, list(_mistakes(plant, flown)))
-    if mistakes:
-        return Wiring(plant, present, moved, tuple(mistakes))
-    refitted = {name: (first[name], value) for name, value in fitted.items() if _far(first[name], value)}
-    return Wiring(plant, present, moved, (), tuple(_doubts(plant, present)), refitted)
-
-
-def _far(first: float, fitted: float) -> bool:
-    """Whether two values of a coefficient differ by more than the factor; of a first value of 0 nobody knows."""
-    return first != 0.0 and not 1.0 / REFITTED <= fitted / first <= REFITTED
-
-
-def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
-    """What no mistake explains and may be right all the same."""
     shares = zip(plant.states, present.unexplained.tolist(), strict=True)
-    if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
-        yield (
-            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a "
-            "mistake in a Reading, an Actuation or the plant's equations"
-        )
+    much = [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]
+    doubt = (
+        f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a mistake "
+        "in a Reading, an Actuation or the plant's equations"
+    )
+    return Wiring(plant, present, moved, tuple(mistakes), (doubt,) if much and not mistakes else ())
 
 
 def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
@@ -370,11 +347,6 @@ class _Fit:
         if self._weights:
             self._known = self._fitted(flown)
         return self._suspicion(mistake, flown, self._errors(flown, self._known)[0])
-
-    def coefficients(self) -> dict[str, float]:
-        """The latest scalar coefficients by name, in physical units."""
-        named = named_weights(self._closure) or {}
-        return {name: value for name, value in named.items() if isinstance(value, float)}
 
     def score(self, flown: Flown) -> float:
         """Score of a wiring with the coefficients of the first guess or the last fit, or a linear fit about them."""
