@@ -120,12 +120,21 @@ def test_the_callback_of_the_documentation_ends_a_training():
     assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
 
 
+def test_the_callback_of_the_documentation_tells_a_logger(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scope = {}
+    exec(compile(blocks("habits.md", "python")[1], "docs/habits.md", "exec"), scope)
+    assert scope["told"]([{"episode": 0, "real_cost": 0.5, "rms/speed [rad/s]": 0.1, "live": "model_free"}]) is None
+    (curve,) = tmp_path.rglob("real_cost.csv")
+    assert curve.read_text().split() == ["0,0.5"] and len(list(tmp_path.rglob("speed.csv"))) == 1
+
+
 @pytest.mark.slow
 def test_the_search_of_the_documentation_runs(tmp_path, monkeypatch):
     """As printed, with a single trial; the same code goes on with the search."""
     pytest.importorskip("optuna", reason="a search needs the extra sweep")
     monkeypatch.chdir(tmp_path)
-    code, scope = blocks("habits.md", "python")[1].replace("n_trials=10", "n_trials=1"), {}
+    code, scope = blocks("habits.md", "python")[2].replace("n_trials=10", "n_trials=1"), {}
     for done in (1, 2):
         exec(compile(code, "docs/habits.md", "exec"), scope)
         assert len(scope["search"].trials) == done
