@@ -19,6 +19,7 @@ from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.sampling import require_request, require_stable_step, rk4_step
 from .plants.sensors import BiasedSensor, UnreadInput
 from .plants.signal import Measurement, Named, Phase, Preview, Signal
+from .plants.sensors import StackedObservations
 from .contract import ContractReport, PlantContractError, check_plant
 from .control.classical import ClassicalController
 from .control.discon import DISCON
@@ -186,6 +187,7 @@ __all__ = [
     "Signal",
     "SmoothClip",
     "Snapshot",
+    "StackedObservations",
     "Start",
     "StateFeedback",
     "StickingActuator",

@@ -23,7 +23,7 @@ from rt_torchrl.plants.actuators import (
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.extension import ExtendedClosure, Extension
 from rt_torchrl.plants.plant import PARTS, Plant
-from rt_torchrl.plants.sensors import BiasedSensor, UnreadInput
+from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations, UnreadInput
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import LaggedCoefficients, NeuralResidual, ScaledCoefficients
 from rt_torchrl.trajectories.rollout import Rollout
@@ -54,11 +54,13 @@ EXTENSIONS = {
     "bias": lambda base: BiasedSensor(base, "position", 0.3, 0.02, scale=0.1),
     "unread": lambda base: UnreadInput(base, "disturbance", 0.5, [2.0]),
     "residual": residual,
+    "stacked": lambda base: StackedObservations(base, 2),
     "delayed resonance": lambda base: DelayedActuator(ResonantActuator(base, "force", 3.0, 0.4), "force", 0.2),
     "biased delay": lambda base: BiasedSensor(DelayedActuator(base, "force", 0.3), "position", 0.3, scale=0.1),
     "delayed bias": lambda base: DelayedActuator(BiasedSensor(base, "position", 0.3, scale=0.1), "force", 0.3),
     "residual around a lag": lambda base: residual(LaggedActuator(base, "force", 0.4)),
     "lag around a residual": lambda base: LaggedActuator(residual(base), "force", 0.4),
+    "lag of the stacked": lambda base: LaggedActuator(StackedObservations(base, 2), "force", 0.4),
 }
 """Every extension of the oracle plant, and those of which one changes what the other needs."""
 
@@ -178,6 +180,9 @@ class Particular(LinearQuadratic):
     def actuate(self, state, command):
         return 0.5 * command + 0.1 * state[..., 1:]
 
+    def memorise(self, t, state, exogenous):
+        return 0.9 * state + 0.01 * exogenous + t.unsqueeze(-1)
+
     def latch(self, state, applied):
         return 1.1 * state + applied
 
@@ -237,8 +242,9 @@ def test_whatever_a_plant_overrides_holds_under_every_extension(kind):
     acting = plant.acting(hidden, applied)
     log = {"position": states[0, :, 0], "velocity": states[0, :, 1]}
     answers = {
-        "observe": (plant.observe(t, now, exogenous), base.observe(t, read, exogenous)[..., :2]),
+        "observe": (plant.observe(t, now, exogenous)[..., :2], base.observe(t, read, exogenous)[..., :2]),
         "actuate": (plant.actuate(now, applied), base.actuate(read, applied)),
+        "memorise": (plant.split(plant.memorise(t, now, exogenous))[0], base.memorise(t, read, exogenous)),
         "latch": (plant.latch(now, applied), plant.joined(base.latch(read, applied), hidden)),
         "running_cost": (
             plant.running_cost(t, now, applied, exogenous),
@@ -283,7 +289,7 @@ def test_whatever_a_plant_overrides_holds_under_every_extension(kind):
         while isinstance(closure, ExtendedClosure):
             closure = closure.base
         assert isinstance(closure, kind_of_closure)
-    assert isinstance(plant.make_policy(seeded()), nn.Linear)
+    assert "stacked" in kind or isinstance(plant.make_policy(seeded()), nn.Linear)
     asked = {method for methods in PARTS.values() for method in methods}
     assert asked == (answers.keys() | {"make_closure", "make_neural_closure", "make_policy"}) - {"discrepancy"}
 

@@ -1,30 +1,41 @@
-"""States that no sensor reads, and that a twin does not know."""
+"""States that no sensor reads and a twin does not know, and policies that observe past observations."""
 
 import math
 
 import pytest
+import test_extensions as extensions
 import torch
+from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from printed_commands import blocks
 from seeds_and_numbers import seeded
 from small_runs import SMALL
 from test_classical import PD
+from test_export_controller import InC
+from test_extensions import flight
+from test_real_system import Rig, connected
 
 from rt_torchrl import (
     BiasedSensor,
+    DelayedActuator,
+    LaggedActuator,
     PlantEnv,
     Run,
     RunConfig,
+    StackedObservations,
     export_c,
+    export_controller,
     load_run,
+    shipped_plants,
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
-from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.real_system import Reading, RealSystem
+from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
 from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
@@ -174,3 +185,163 @@ def test_a_twin_that_diverges_on_some_episodes_is_infinitely_wrong_there_alone()
     assert mean_with_confidence(found) == {"mean": math.inf, "confidence_interval": [math.inf, math.inf]}
     sound = unseen.identification_costs(BASE, closure, flown)
     torch.testing.assert_close(found[[0, 2]], sound[[0, 2]])
+
+
+# Policies that observe past observations: by hand, in both engines, with extensions, in C, in runs and from logs.
+
+
+DT = 0.1
+
+
+class Timed(LinearQuadratic):
+    """The oracle plant, of which policies observe what depends on time, state and input."""
+
+    def observe(self, t, state, exogenous):
+        x, _ = state.unbind(-1)
+        return torch.stack([x + torch.sin(3.0 * t), exogenous[..., 0] + 0.0 * x], -1)
+
+    def suspects(self):
+        return {"late": DelayedActuator(self, "force", 2 * self.dt), "lag": LaggedActuator(self, "force", 0.3)}
+
+
+EXTENSIONS = {"none": lambda base: base} | {
+    name: extensions.EXTENSIONS[name] for name in ("lag", "delay", "bias", "unread", "residual")
+}
+
+
+def observed(plant, states, exogenous):
+    """The observations in every interval of a flight."""
+    n = exogenous.shape[1]
+    return plant.observe(plant.dt * torch.arange(n, dtype=torch.float64), states[:, :n], exogenous)
+
+
+def by_hand(now, count):
+    """Present and past observations, from the present ones of a flight."""
+    places = torch.arange(now.shape[1])
+    return torch.cat([now[:, (places - k).clamp(min=0)] for k in range(count + 1)], -1)
+
+
+@pytest.mark.parametrize("kind", EXTENSIONS)
+def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(kind):
+    extend, base, engine = EXTENSIONS[kind], Timed(), "native"
+    plain = extend(base)
+    start, exogenous, commands = flight(plain, 12, 3)
+    flown = Rollout(plain, plain.closure, engine=engine)(start, exogenous, commands)
+    expected = by_hand(observed(plain, flown.states, exogenous), 3)
+    for plant in (StackedObservations(plain, 3), extend(StackedObservations(base, 3))):
+        assert plant.unread == plain.unread and len(plant.observations) == 8
+        stacked = plant.draw_initial_state(3, seeded(3))
+        found = Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
+        torch.testing.assert_close(observed(plant, found.states, exogenous), expected, rtol=1e-13, atol=1e-13)
+        now = observed(plant, found.states, exogenous)[..., :2]
+        torch.testing.assert_close(observed(plant, found.states, exogenous), by_hand(now, 3), rtol=1e-14, atol=1e-14)
+        costs = [
+            p.running_cost(torch.zeros(1), x.states[:, :-1], commands, exogenous)
+            for p, x in ((plain, flown), (plant, found))
+        ]
+        torch.testing.assert_close(*costs, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", shipped_plants())
+def test_the_plants_and_all_that_they_suspect(name):
+    plant = StackedObservations(shipped_plants()[name](), 2)
+    suspects = {**plant.suspects(), **plant.further_suspects()}
+    assert suspects.keys() == {**plant.base.suspects(), **plant.base.further_suspects()}.keys()
+    n_o, readings = len(plant.base.observations), len(plant.states)
+    for each in (plant, *suspects.values()):
+        assert each.readings == plant.states and each.observations == plant.observations
+        start, exogenous, commands = flight(each, 4)
+        with torch.no_grad():
+            states = Rollout(each, each.closure, engine="autograd")(start, exogenous, commands).states
+        found = observed(each, states, exogenous)
+        torch.testing.assert_close(found, by_hand(found[..., :n_o], 2), rtol=0.0, atol=0.0)
+        # A twin begins a replay with what was read.
+        again = each.at_rest(states[:, 0, :readings])
+        assert torch.equal(again[:, :readings], states[:, 0, :readings])
+
+
+class Mass(LinearQuadratic):
+    """A free mass of which only the position is seen: x_{k+1} = x_k + Δt v_k + ½Δt² a_k, v_{k+1} = v_k + Δt a_k."""
+
+    A, true_closure = ((0.0, 1.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, 0.0))
+    observations = LinearQuadratic.observations[:1]
+
+    def observe(self, t, state, exogenous):
+        return state[..., :1]
+
+
+@needs_compiler
+def test_the_controller_in_c_holds_the_past_observations(tmp_path):
+    plant = StackedObservations(Mass(dt=DT, horizon=5.0), 2)
+    agreement = export_controller(LinearGain([[3.0, -2.0, 0.5]]), tmp_path / "mass.c", plant, name="mass")
+    # They are those of the measured states, without the curvature within an interval.
+    assert agreement.difference < 1e-12 and agreement.from_plant < 1e-12
+    in_c, positions = InC(tmp_path / "mass.c", 1, 2, 1), [0.3, 0.5, -0.2, 0.1, 0.4]
+    in_c.start(positions[0])
+    seen = [positions[0]] * 2 + positions
+    for k, x in enumerate(positions):
+        assert in_c.step(x)[0] == pytest.approx(-3.0 * x + 2.0 * seen[k + 1] - 0.5 * seen[k], rel=1e-14)
+
+
+def test_past_observations_follow_from_a_log():
+    plant = StackedObservations(Timed(), 3)
+    start, exogenous, commands = flight(plant, 12)
+    states = Rollout(plant, plant.closure)(start, exogenous, commands).states[0].detach()
+    log = {signal.name: states[:, k] for k, signal in enumerate(LinearQuadratic.states)}
+    found = plant.complete_states(log, exogenous[0], commands[0])
+    torch.testing.assert_close(found[1:], states[1:], rtol=1e-14, atol=1e-14)
+    assert torch.equal(found[0, 2:], observed(plant, states[None], exogenous[:1])[0, 0, 2:])
+
+
+def test_a_real_system_that_reports_the_states_of_the_plant_alone():
+    """Two episodes are those of the stacked plant itself."""
+    base = Timed(horizon=2.0)
+    plant = StackedObservations(base, 2)
+    policy = LinearGain(0.1 * torch.arange(1.0, 7.0).double()[None])
+    system, own = connected(plant, rig=Rig(base), computes=True), PlantEnv(plant)
+    for number in range(2):
+        found = system.reset()
+        own.set_seed(episode_seed(0, number), static_seed=True)
+        other, seen = own.reset(), []
+        for _ in range(plant.n_steps):
+            stepped = [
+                env.step(now.set("action", policy(now["observation"]).detach()))
+                for env, now in ((system, found), (own, other))
+            ]
+            seen.append(stepped[0]["observation"])
+            for key in ("observation", "state", "action", ("next", "reward"), ("next", "observation")):
+                torch.testing.assert_close(*(entries[key] for entries in stepped), rtol=1e-11, atol=1e-11)
+            found, other = (env.step_mdp(entries) for env, entries in zip((system, own), stepped, strict=True))
+        seen = torch.stack(seen, 1)
+        torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
+        assert found["done"].all()
+
+
+def test_past_observations_are_what_sensors_read_then():
+    """Noise falls on a measurement once: what a policy remembers of it gets no other one."""
+    noise = 0.3
+    for plant in (
+        StackedObservations(Timed(horizon=2.0), 2),
+        EXTENSIONS["lag"](StackedObservations(Timed(horizon=2.0), 2)),
+    ):
+        found = PlantEnv(plant, noise=noise, seed=4).rollout(10)
+        seen = found["observation"]
+        torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-14, atol=0.0)
+        torch.testing.assert_close(found["state"][:, 1:, 2:4], seen[:, :-1, :2], rtol=1e-14, atol=0.0)
+        clean = PlantEnv(plant, seed=4).rollout(10)["observation"]
+        assert ((seen - clean).abs()[..., :1] > 1e-3).any()
+        policy = plant.make_policy(seeded())
+        actor = LivePolicy(plant, policy, ExplorationConfig(), generator=seeded(5))
+        actor.begin(policy, strength=0.0)
+        envs = [PlantEnv(plant, noise=noise, seed=4) for _ in range(2)]
+        collectors = FlightCollector(envs[0], actor), EpisodeCollector(envs[1], actor, plant)
+        by_machine, by_steps = (collector.rollout()["observation"] for collector in collectors)
+        torch.testing.assert_close(by_machine, by_steps, rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(by_machine, by_hand(by_machine[..., :2], 2), rtol=1e-14, atol=0.0)
+
+
+def test_the_page_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = {}
+    exec("\n".join(blocks("observations_and_costs.md", "python")), found)
+    assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2

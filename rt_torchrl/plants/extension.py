@@ -91,7 +91,7 @@ class Extension(Plant):
         self.base, self.name, self.unread = base, base.name, base.unread + len(hidden)
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
-        self.controller_states, self.end_cost = base.controller_states, base.end_cost
+        self.controller_states, self.memories, self.end_cost = base.controller_states, base.memories, base.end_cost
         self._parameterised = own is not None
 
     @property

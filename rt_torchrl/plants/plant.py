@@ -45,7 +45,7 @@ REQUIRED = ("vector_field", "running_cost", "draw_initial_state", "draw_exogenou
 """Methods that a plant must define."""
 PARTS = {
     "controller": ("observe", "actuate", "controller_start", "make_policy"),
-    "memory": ("latch",),
+    "memory": ("memorise", "latch"),
     "task": ("running_cost", "terminal_cost", "ended", "merit", "setpoints", "draw_exogenous"),
     "start": ("at_rest", "complete_states", "draw_initial_state"),
     "closure": ("make_closure", "make_neural_closure"),
@@ -93,6 +93,8 @@ class Plant(nn.Module):
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
+    memories: tuple[str, ...] = ()
+    """Names of those of them that :meth:`memorise` alone writes: they hold what was measured, without further noise."""
     state_sizes: tuple[float, ...] = ()
     """Usual sizes of the states, in their units; by default ones."""
     end_cost: float | None = None
@@ -188,6 +190,13 @@ class Plant(nn.Module):
         """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
+    def memorise(self, t: Time, state: State, exogenous: Input) -> State:
+        """The state, into which the controller writes what it keeps of this moment's signals; by default nothing.
+
+        Inputs are those that sensors read, also where an extension lets others act on the plant.
+        """
+        return state
+
     def latch(self, state: State, applied: Action) -> State:
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
@@ -200,7 +209,7 @@ class Plant(nn.Module):
         return rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        r"""One control interval from ``t`` on, :math:`\Phi`: actuate, advance under the held action, latch.
+        r"""One control interval from ``t`` on, :math:`\Phi`: memorise, actuate, advance under the held action, latch.
 
         The closure is the true one in the real system, and the learned one in the twin.
         """
@@ -210,6 +219,7 @@ class Plant(nn.Module):
         self, scheme: Callable[..., State], t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module
     ) -> Transition:
         """One control interval in which another scheme than :meth:`advance`, with its arguments, integrates."""
+        state = self.memorise(t, state, exogenous)
         applied = self.actuate(state, command)
         return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
@@ -389,6 +399,15 @@ def require_end_cost(plant: Plant) -> None:
         )
     if plant.end_cost is not None and not torch.tensor(plant.end_cost).isfinite():
         raise ValueError(f"end_cost={plant.end_cost} of plant {plant.name!r} must be finite.")
+
+
+def with_memories(plant: Plant, end: State, t: Tensor, measured: State, exogenous: Tensor) -> Tensor:
+    """The end of an interval, at whose start the controller memorised what was measured and not what was true."""
+    if not plant.memories:
+        return end
+    kept = plant.memorise(t, measured, exogenous)
+    sources = (kept if signal.name in plant.memories else end for signal in plant.states)
+    return torch.stack([source[..., k] for k, source in enumerate(sources)], -1)
 
 
 def held(plant: Plant, state: State, end: State) -> Tensor:

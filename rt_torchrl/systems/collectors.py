@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, with_memories
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
@@ -54,6 +54,12 @@ class ExploringInterval(Interval):
         noise, factor = drive.command.split((len(self.plant.actions), len(self.plant.states)), -1)
         observation = self.plant.observe(drive.t, state * factor, drive.exogenous)
         return (self.policy(observation) + noise).clamp(self.low, self.high)
+
+    def end(self, state: Tensor, command: Tensor, drive: Drive) -> Tensor:
+        """The state at the end of the interval, with what was measured at its start in the controller's memories."""
+        _, factor = drive.command.split((len(self.plant.actions), len(self.plant.states)), -1)
+        end = super().end(state, command, drive)
+        return with_memories(self.plant, end, drive.t, state * factor, drive.exogenous)
 
 
 class ExploringController(RememberingInterval, ExploringInterval):

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from rt_torchrl.options import require_number
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, with_memories
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -41,7 +41,8 @@ class PlantEnv(EnvBase):
         device: device on which the environment runs.
         noise: standard deviation of the sensors' error as a share of the value that they read. Every reported state is
             s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
-            the true state.
+            the true state. What a controller memorises (:attr:`Plant.memories`) is what was measured then, and gets no
+            further noise.
         wear: function from the number of an episode, counted from 0, to the real system's closure in it; with None the
             plant's own closure holds in all episodes.
 
@@ -140,7 +141,7 @@ class PlantEnv(EnvBase):
                 f"plant {self.plant.name!r} diverged at t = {t.item():g} s: state {self._state.tolist()}, "
                 f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
             )
-        self._state = transition.state
+        self._state = with_memories(self.plant, transition.state, t, self._state * self._factor, exogenous)
         self._step_count += 1
         over = torch.full((1, 1), self._step_count >= self.plant.n_steps, device=self.device)
         ends = self.plant.end_cost is not None
@@ -171,7 +172,9 @@ class PlantEnv(EnvBase):
         shape, like = (1, len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
-        return 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
+        drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
+        read = [signal.name not in self.plant.memories for signal in self.plant.states]
+        return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
 
     def _now(self) -> tuple[Float[Tensor, " 1"], Float[Tensor, "1 n_z"]]:
         """Time and exogenous input of this interval; after the last interval, the input is that of the last one."""
