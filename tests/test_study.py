@@ -39,6 +39,7 @@ def leave(folder, *, seed, costs, curve=(4.0, 2.0), arm="twinning", plant="tanks
         {"real_cost": 2.0 * cost if cost else cost, "J_a_unseen": cost, "seconds": {"plan": 1.5, "learn": 0.5}}
         for cost in curve
     ]
+    episodes[0]["alarm"] = 1.0
     summary = {"live": "model_based", "unseen": unseen}
     (folder / "metrics.json").write_text(json.dumps({"plant": plant, "episodes": episodes, "summary": summary}))
     return folder
@@ -66,7 +67,8 @@ def test_every_number_of_a_table_is_that_by_hand(tmp_path):
     assert of_a["J_a_ratio"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
     assert of_a["episodes_to_optimum"] == {"median": math.inf, "least": math.inf, "greatest": math.inf}
     assert of_b["episodes_to_optimum"] == {"median": 2.0, "least": 2.0, "greatest": math.inf}
-    assert of_a["seconds"]["median"] == 4.0
+    assert of_a["regret"]["median"] == 10.0  # beyond two episodes of the optimum
+    assert of_a["alarms"]["median"] == 1.0 and of_a["seconds"]["median"] == 4.0
     assert of_a["merit"] == {"power [W]": 1.0}
     # Logarithms of the ratios are 0.1, 0.2, 0.3: mean 0.2, deviation 0.1, and t(0.975, 2) = 4.30265.
     half = 4.302652729749464 * 0.1 / math.sqrt(3.0)
@@ -87,8 +89,8 @@ def test_the_table_shows_these_numbers(tmp_path):
     first, second = ([FinishedRun.read(folder) for folder in group] for group in rows(tmp_path))
     comparison = Comparison("tanks", [Row(name="a", runs=first, optimum=1.0), Row(name="b", runs=second, optimum=1.0)])
     table = cells(comparison.table())
-    assert table["a"] == "a|3|2 (1 … 3)|+100 %|1.000|12|1.000|never|4".split("|")
-    assert table["b"][4] == "1.221 [0.953, 1.566]" and table["b"][7] == "2 (2 … never)"
+    assert table["a"] == "a|3|2 (1 … 3)|+100 %|1.000|12|1.000|10|never|1|4".split("|")
+    assert table["b"][4] == "1.221 [0.953, 1.566]" and table["b"][8] == "2 (2 … never)"
     assert table["PI"][:3] == ["PI", "", "2"]
     assert "| PI | 5 |" in comparison.table() and "| a | 1 |" in comparison.table()  # the plant's own quantities
     wide = [comparison, Comparison("others", [Row(name="a", runs=first), Row(name="b", runs=first)])]

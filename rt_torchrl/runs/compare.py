@@ -44,6 +44,7 @@ class FinishedRun:
         merit: mean of each of the plant's own quantities under that policy.
         controllers: J_a of each classical controller, mean over the unseen episodes.
         controllers_merit: the plant's own quantities of each classical controller.
+        alarms: number of episodes with an alarm.
         seconds: time of the six steps in all episodes [s].
     """
 
@@ -58,6 +59,7 @@ class FinishedRun:
     merit: dict[str, float]
     controllers: dict[str, float]
     controllers_merit: dict[str, dict[str, float]]
+    alarms: int
     seconds: float
 
     @property
@@ -98,6 +100,7 @@ class FinishedRun:
             merit=_means(unseen["merit"][live]),
             controllers={name: statistics.fmean(_numbers(unseen["costs"][name])) for name in unseen["baselines"]},
             controllers_merit={name: _means(judged["merit"]) for name, judged in unseen["baselines"].items()},
+            alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
             seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),
         )
 
@@ -127,6 +130,13 @@ class Row:
         return {run.seed: sum(run.real) for run in self.runs}
 
     @property
+    def regret(self) -> list[float] | None:
+        """What each run has paid beyond as many episodes of the optimum."""
+        if self.optimum is None:
+            return None
+        return [sum(run.real) - len(run.real) * self.optimum for run in self.runs]
+
+    @property
     def episodes_to_optimum(self) -> list[float] | None:
         """Number of real episodes until the live policy of each run is near the optimum; infinite for never."""
         if self.optimum is None or not all(run.judged for run in self.runs):
@@ -149,7 +159,9 @@ class Row:
             "optimum": self.optimum,
             "paid": spread(list(self.paid.values())),
             "paid_ratio": paired_ratio(self.paid, first.paid) if same else None,
+            "regret": spread(self.regret),
             "episodes_to_optimum": spread(self.episodes_to_optimum),
+            "alarms": spread([float(run.alarms) for run in self.runs]),
             "seconds": spread([run.seconds for run in self.runs]),
             "merit": {name: statistics.median(run.merit[name] for run in self.runs) for name in self.runs[0].merit},
             "curves": [run.curve for run in self.runs],
@@ -223,19 +235,20 @@ class Comparison:
                     with_interval(row["J_a_ratio"]),
                     with_range(row["paid"]),
                     with_interval(row["paid_ratio"]),
+                    with_range(row["regret"]),
                     with_range(row["episodes_to_optimum"]).replace("inf", "never"),
-                    with_range(row["seconds"]),
+                    *(with_range(row[key]) for key in ("alarms", "seconds")),
                 ]
             )
             merits[name] = row["merit"]
         for name, (cost, merit) in self.controllers().items():
-            lines.append([name, "", f"{cost:.4g}", *[""] * 6])
+            lines.append([name, "", f"{cost:.4g}", *[""] * 8])
             merits[name] = merit
         optima = {row.optimum: row.name for row in reversed(self.rows) if row.optimum is not None}
         for cost, name in reversed(optima.items()):
-            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 6])
+            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 8])
         header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
-        header += [f"Σ over {first}", "episodes to 110 %", "seconds"]
+        header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "seconds"]
         kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
         tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
         if quantities := list(self.rows[0].runs[0].merit):
