@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 import json
 import math
 import numbers
@@ -71,7 +72,8 @@ def configuration(options: type[Options]) -> type[Options]:
 
     The declarations are those of pydantic: ``Annotated[int, Field(ge=1)]``, or :data:`AtLeastOne` for it. A command
     line and ``config.json`` are read by the same declarations. What concerns several options is checked in
-    ``__post_init__``, which raises a ``ValueError``. A class that derives from one of options is decorated, too.
+    ``__post_init__``, which raises a ``ValueError``. A class that derives from one of options is decorated, too; an
+    option that it declares anew by the bare type, such as ``episodes: int = 6``, keeps what its base allows.
 
     Args:
         options: class with an annotation for each option.
@@ -80,6 +82,11 @@ def configuration(options: type[Options]) -> type[Options]:
         ValueError: when an instance is made, if an option does not exist, or a value is not allowed; the message names
             the option, its value, and what is allowed.
     """
+    for name, declared in inspect.get_annotations(options).items():
+        inherited = (inspect.get_annotations(base).get(name) for base in options.__mro__[1:])
+        allowed = next((hint for hint in inherited if typing.get_origin(hint) is Annotated), None)
+        if allowed is not None and typing.get_args(allowed)[0] is declared:
+            options.__annotations__[name] = allowed
     made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)(options)
     validated = made.__init__
 

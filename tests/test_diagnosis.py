@@ -22,7 +22,7 @@ from rt_torchrl import (
 from rt_torchrl.options import configuration
 from rt_torchrl.runs.diagnosis import Reason
 
-TWIN, MINIMUM, CLASS, INPUTS, COST = range(5)
+CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST = range(6)
 
 
 class Spring(LinearGain):
@@ -95,7 +95,7 @@ def rewrite(run, change):
 def test_a_run_that_ended_well_has_no_reason_and_the_user_judges_that_it_acts_more(run):
     reasons = diagnose(run)
     # Ten episodes from random initial states scatter too much to compare them with those of the plan.
-    assert [reason.holds for reason in reasons] == [False, False, False, None, None]
+    assert [reason.holds for reason in reasons] == [False, False, False, False, None, None]
     assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
     evidence = reasons[COST].evidence
     assert "judge whether it is better: mean force [N]" in evidence and "against 0 of still" in evidence

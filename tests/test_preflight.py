@@ -85,6 +85,44 @@ class Reversed(FourTanks):
         return signs * super().vector_field(t, state, action, exogenous, closure)
 
 
+class Arm(Plant):
+    """Two joints with torques of their own and friction, whose angles have no zero that the dynamics show."""
+
+    name = "arm"
+    states = tuple(Signal(symbol=f"q_{k}", name=f"angle_{k}", unit="rad") for k in (1, 2))
+    states += tuple(Signal(symbol=f"w_{k}", name=f"rate_{k}", unit="rad/s") for k in (1, 2))
+    actions = tuple(Signal(symbol=f"u_{k}", name=f"torque_{k}", unit="N m", low=-1.0, high=1.0) for k in (1, 2))
+    inputs = ()
+    state_sizes = (0.1, 0.1, 1.0, 1.0)
+    measurements = tuple(Measurement.of(state) for state in states)
+
+    def __init__(self):
+        super().__init__(dt=0.02, horizon=1.0, closure=self.make_closure())
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates, (inertia, friction) = state[..., 2:], closure(state).split(1, -1)
+        return torch.cat([rates, (action - friction * rates) / inertia], -1)
+
+    def running_cost(self, t, state, applied, exogenous):
+        return state[..., :2].square().sum(-1)
+
+    def draw_initial_state(self, batch, generator):
+        return 0.1 * torch.rand(batch, 4, generator=generator, dtype=torch.float64)
+
+    def draw_exogenous(self, batch, generator):
+        return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64)
+
+    def make_closure(self, generator=None):
+        return Inertia([0.1, 0.05])
+
+
+class Inertia(PositiveCoefficients):
+    """Inertia and friction of each joint."""
+
+    names = {"inertia": "kg m^2", "friction": "N m s"}
+
+
+ARM = Arm()
 PENDULUM, TURBINE, TANK = Pendulum(horizon=5.0), WindTurbine(horizon=60.0), CryogenicTank(horizon=6000.0)
 LEVELS, REVERSED = FourTanks(), Reversed()
 
@@ -154,12 +192,14 @@ MISTAKES = {
         {"inputs": Reading(keys=("state",), of=lambda values: values[..., :2])},
         "state level_1 and input set_point_1 have the same readings",
     ),
+    "all torques": (ARM, {"sent": (-1.0, 0.0)}, "all actions have the other sign"),
+    "all angles": (ARM, {"scale": [-1.0, -1.0, 1.0, 1.0]}, "all states in rad are of the other sign"),
     "equation": (REVERSED, {"real": LEVELS}, "the equation of state level_3 has the other sign"),
 }
 
 
 QUICK = ("torque has the other sign", "degrees for radians", "torque one interval late", "°C for K")
-QUICK += tuple(name for name, (plant, *_) in MISTAKES.items() if plant in (LEVELS, REVERSED))
+QUICK += tuple(name for name, (plant, *_) in MISTAKES.items() if plant in (ARM, LEVELS, REVERSED))
 
 
 @pytest.mark.parametrize(
@@ -224,6 +264,17 @@ def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_an
     assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
     with pytest.warns(UserWarning, match=f"the twin leaves {100.0 * share:.3g} % of level_1, .* unexplained: noise of"):
         check.require()
+
+
+def test_a_start_far_from_what_the_plant_draws_is_a_warning():
+    """The zero of an angle shows nowhere else."""
+    check = check_real_system(wired(ARM, offset=only(ARM, 1, math.pi / 2.0, 0.0)), ARM)
+    assert not check.mistakes and len(check.doubts) == 1
+    with pytest.warns(
+        UserWarning, match="state angle_2 is read between 1.5.* at the start, .* draws 0.00.* a wrong zero"
+    ):
+        check.require()
+    check_real_system(wired(ARM), ARM).require()
 
 
 @pytest.mark.parametrize("column", [0, 1])

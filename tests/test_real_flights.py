@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import operator
 import signal
 
 import pytest
@@ -131,8 +132,11 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     paid = summary["cost_of_learning"]
     assert paid["episodes"] == 9 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)
-    costs = summary["real_unseen"]["costs"]
+    costs, flown = summary["real_unseen"]["costs"], summary["real_unseen"]["controllers"]
     assert [*costs] == [live, "cascade", "PD"]
+    assert "ratio" not in flown[live] and flown["PD"]["cheaper"] == sum(map(operator.lt, costs[live], costs["PD"]))
+    assert flown["PD"]["ratio"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
+    assert f"the live policy costs {flown['PD']['ratio']:.4g} of it, cheaper in {flown['PD']['cheaper']} of 2" in said
     assert [cost for each in costs.values() for cost in each] == pytest.approx(rig.costs[3:], rel=1e-9)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     policy = run.algorithm.policies[live]
@@ -199,6 +203,14 @@ def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
     paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]
     assert len(rig.flights) == 2 + 2 == paid["episodes"]
     assert paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
+
+
+def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
+    rig = machine()
+    first = run_on(rig, tmp_path, real_unseen=2).train()["summary"]
+    again = run_on(rig, tmp_path, real_unseen=2, resume=True).train()["summary"]
+    assert len(rig.flights) == 2 + 2 and again["real_unseen"] == first["real_unseen"]
+    assert again["cost_of_learning"] == first["cost_of_learning"]
 
 
 def test_after_an_interrupt_nothing_flies(tmp_path):

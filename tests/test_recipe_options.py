@@ -202,6 +202,18 @@ def test_what_an_option_cannot_be_is_refused_in_code_and_in_a_file(options, mess
             read_options(Example, options)
 
 
+def test_an_option_that_a_recipe_declares_anew_keeps_what_its_base_allows():
+    @configuration
+    class Fewer(Example):
+        count: int = 6
+        rate: float = 0.5
+
+    assert Fewer().count == 6 and Example().count == 1
+    for options in ({"count": 0}, {"rate": 2.0}):
+        with pytest.raises(ValueError, match="must be"):
+            Fewer(**options)
+
+
 def test_a_class_that_checks_none_of_its_options_is_refused():
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Unchecked(RunConfig):

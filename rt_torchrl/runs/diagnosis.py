@@ -1,4 +1,4 @@
-"""Good twin, poor policy: which of five reasons holds in a finished run, and what says so."""
+"""Good twin, poor policy: which of six reasons holds in a finished run, and what says so."""
 
 import copy
 import math
@@ -53,7 +53,14 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
     validation, costs = unseen.validation(), unseen.control_costs(policy)
     assert validation is not None  # the closure of a twin is known
     best, minimum = _minimum(run, unseen, validation, costs)
-    return [_twin(run), minimum, _class(run, unseen, validation, best), _inputs(run, costs), _merits(run)]
+    return [
+        _classical(run),
+        _twin(run),
+        minimum,
+        _class(run, unseen, validation, best),
+        _inputs(run, costs),
+        _merits(run),
+    ]
 
 
 def _dearer(costs: Costs, others: Costs, share: float) -> bool | None:
@@ -76,6 +83,27 @@ def _twin(run: LoadedRun) -> Reason:
     return Reason(name, bool(flown[-1]["alarm"]), evidence, remedy)
 
 
+def _classical(run: LoadedRun) -> Reason:
+    """Whether a classical controller was cheaper at the end, on the real system where it was flown."""
+    name = "a classical controller is better"
+    remedy = "more twinning.planner.iterations and realisations, observations of what that controller reads, or it"
+    summary = run.metrics["summary"]
+    real, unseen = summary.get("real_unseen", {"controllers": {}})["controllers"], summary["unseen"]
+    others = {key: one["J_a"]["mean"] for key, one in unseen["baselines"].items()}
+    own, where = unseen[f"J_a_{run.live}"]["mean"], unseen["judged_on"]
+    if run.live in real:
+        others = {key: one["J_a"]["mean"] for key, one in real.items() if key != run.live}
+        own, where = real[run.live]["J_a"]["mean"], "real system"
+    known = {key: cost for key, cost in others.items() if cost is not None}
+    if own is None or not known:
+        return Reason(
+            name, None, "no classical controller flew beside the policy, or the policy has no finite cost", remedy
+        )
+    best = min(known, key=known.__getitem__)
+    evidence = f"{best} costs {known[best]:.4g}, the policy {own:.4g} ({where})"
+    return Reason(name, known[best] < own, evidence, remedy)
+
+
 def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, costs: Costs) -> tuple[Costs, Reason]:
     """The least costs of this class of policies that are found on the twin, and whether the policy is far above them.
 
@@ -95,7 +123,9 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes,
     candidates = exact_optimum(validation, drawn), exact_optimum(validation, present, starts=1)
     best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
     evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
-    return min(costs, best, key=torch.mean), Reason(name, _dearer(costs, best, MINIMUM), evidence, remedy)
+    # A search that ends far above the policy is poor itself, and says nothing of the plan.
+    holds = None if _dearer(best, costs, MINIMUM) else _dearer(costs, best, MINIMUM)
+    return min(costs, best, key=torch.mean), Reason(name, holds, evidence, remedy)
 
 
 def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, best: Costs) -> Reason:

@@ -216,15 +216,40 @@ def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor])
     """The entry ``real_unseen`` of the summary.
 
     Args:
-        flights: flights by the name of the controller.
+        flights: flights by the name of the controller, of the live policy first if it flew.
         J_p: costs of the twin on the flights of the live policy, by name; empty without such flights.
     """
+    first = next(iter(flights.values()))
     return {
         "controllers": {
-            name: {"episodes": len(one.judged.control_costs)} | one.judged.statistics() for name, one in flights.items()
+            name: {"episodes": len(one.judged.control_costs)} | one.judged.statistics() | beside(first, one)
+            for name, one in flights.items()
         },
         "costs": {name: one.judged.control_costs.tolist() for name, one in flights.items()},
     } | {name: mean_with_confidence(costs) for name, costs in J_p.items()}
+
+
+def beside(first: RealFlights, other: RealFlights) -> dict[str, Any]:
+    """What the first controller costs over another one, where both flew the same episodes; nothing elsewhere.
+
+    ``ratio`` is that of the means, and ``cheaper`` the number of episodes in which the first one is cheaper.
+    """
+    same = torch.equal(first.flown.states[:, 0], other.flown.states[:, 0])
+    if first is other or not (same and torch.equal(first.flown.exogenous, other.flown.exogenous)):
+        return {}
+    costs, others = first.judged.control_costs, other.judged.control_costs
+    return {"ratio": (costs.mean() / others.mean()).item(), "cheaper": int((costs < others).sum())}
+
+
+def judged_before(folder: Path, episodes: int, count: int) -> dict[str, Any] | None:
+    """The entry that an earlier end of a run has left after as many episodes, with so many flights; None without."""
+    if not (folder / "metrics.json").is_file():
+        return None
+    metrics = read_metrics(folder)
+    found: dict[str, Any] | None = metrics["summary"].get("real_unseen")
+    if found is None or len(metrics["episodes"]) != episodes:
+        return None
+    return found if all(one["episodes"] == count for one in found["controllers"].values()) else None
 
 
 def paid_before(folder: Path) -> list[float | None]:

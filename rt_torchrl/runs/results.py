@@ -327,6 +327,11 @@ def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
         lines.append(
             f"  J_a on the real system, {one['episodes']} other episodes of {who}: {mean} {_interval(one['J_a'])}"
         )
+        if "ratio" in one:
+            cheaper = f"cheaper in {one['cheaper']} of {one['episodes']}"
+            lines.append(
+                f"    on the same episodes the live policy costs {_number(one['ratio'], '.4g')} of it, {cheaper}"
+            )
         lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
     return lines
 

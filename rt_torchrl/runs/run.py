@@ -149,6 +149,7 @@ class Run:
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
+            self._judged: dict[str, Any] | None = None
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
@@ -332,6 +333,10 @@ class Run:
             return {}
         if len(self.episodes) < self.config.episodes and self.ended is None:
             return {}  # who has pressed Ctrl-C does not want the real system to go on
+        self._judged = real_side.judged_before(self.folder, len(self.episodes), self.config.real_unseen)
+        if self._judged:
+            bar.write("the real system has been flown after these episodes; it is not flown again")
+            return {}
         parts = self.initial_policies, self.baselines
         found = real_side.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
         live = self.algorithm.referee.live
@@ -361,6 +366,8 @@ class Run:
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         if real:
             summary["real_unseen"] = self._real_results(real)
+        elif self._judged:
+            summary["real_unseen"] = self._judged
         summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_side.paid(real)])
         better = judged[summary["better"]].control_costs
         summary |= results.reference_entry(self.config, self.unseen, self.make_policy, better)

@@ -223,13 +223,18 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
     if not mistakes and not explained:
         mistakes = _better(present, fit, flown, list(_mistakes(plant, flown)))
+    doubts = () if mistakes else (*_doubts(plant, present), *_strange_starts(plant, flown))
+    return Wiring(plant, present, moved, tuple(mistakes), doubts)
+
+
+def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
+    """What no mistake explains and may be right all the same."""
     shares = zip(plant.states, present.unexplained.tolist(), strict=True)
-    much = [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]
-    doubt = (
-        f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a mistake "
-        "in a Reading, an Actuation or the plant's equations"
-    )
-    return Wiring(plant, present, moved, tuple(mistakes), (doubt,) if much and not mistakes else ())
+    if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
+        yield (
+            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a "
+            "mistake in a Reading, an Actuation or the plant's equations"
+        )
 
 
 def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
@@ -242,16 +247,34 @@ def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]
             yield f"{signals[k]} and {signals[m]} have the same readings"
 
 
+def _strange_starts(plant: Plant, flown: Flown) -> Iterator[str]:
+    """Which states are read at the start far outside what the plant draws, as from a wrong zero or other starts."""
+    drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
+    starts = flown.states[flown.t == 0.0]
+    for signal, course, read in zip(plant.states, drawn.unbind(-1), starts.unbind(-1), strict=True):
+        if len(starts) and _outside(course, read):
+            yield (
+                f"state {signal.name} is read between {read.min():.4g} and {read.max():.4g} {signal.unit} at the "
+                f"start, where draw_initial_state of the plant draws {course.min():.4g} to {course.max():.4g}: a wrong "
+                "zero, or other starts than those that plans are made for"
+            )
+
+
+def _outside(course: Tensor, read: Tensor) -> bool:
+    """Whether readings lie beyond what is drawn by more than its width."""
+    low, high = course.min().item(), course.max().item()
+    width = high - low or max(abs(low), abs(high))
+    return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > (BEYOND - 1.0) * width
+
+
 def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
     """Which inputs are read far outside what the plant draws, or at a small share of it."""
     if not plant.inputs:
         return
     drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
     for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
-        low, high, size = course.min().item(), course.max().item(), course.abs()
-        width = high - low or size.max().item()
-        outside = max(low - read.min().item(), read.max().item() - high)
-        if width > 0.0 and (outside > (BEYOND - 1.0) * width or BEYOND * read.abs().max() < size.min()):
+        low, high = course.min().item(), course.max().item()
+        if _outside(course, read) or BEYOND * read.abs().max() < course.abs().min():
             yield (
                 f"input {signal.name} is read between {read.min():.4g} and {read.max():.4g} {signal.unit}, where "
                 f"draw_exogenous of the plant draws {low:.4g} to {high:.4g}"
@@ -414,7 +437,8 @@ def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
     yield from _signal_mistakes("input", plant.inputs, flown, ("exogenous",))
     for unit in dict.fromkeys(signal.unit for signal in plant.states):
         alike = [k for k, signal in enumerate(plant.states) if signal.unit == unit]
-        for words, scale, offset in _units(unit, FACTORS) if len(alike) > 1 else ():
+        together = [("of the other sign", -1.0, 0.0), *_units(unit, FACTORS)]
+        for words, scale, offset in together if len(alike) > 1 else ():
             changed = flown
             for k in alike:
                 changed = _changed(changed, ("states", "ends"), k, scale, offset)
@@ -440,6 +464,8 @@ def _signal_mistakes(
     what: str, signals: Sequence[Signal], flown: Flown, names: tuple[str, ...]
 ) -> Iterator[tuple[str, Flown]]:
     """The signs, units and orders of one kind of signals, whose values the flights hold under the names."""
+    if what == "action" and len(signals) > 1:
+        yield "all actions have the other sign", flown._replace(actions=-flown.actions)
     for k, signal in enumerate(signals):
         yield f"{what} {signal.name} has the other sign", _changed(flown, names, k, -1.0, 0.0)
         for words, scale, offset in _units(signal.unit, () if what == "action" else FACTORS):
