@@ -2,13 +2,14 @@
 
 The classical controller of the recipe, do-mpc with the coefficients of the data sheet and with those that the twin has
 found, and a learner of stable-baselines3 after as many real episodes and after ``--times`` as many fly the episodes
-that judge the recipe's live policy. The table has J_a of these, the costs of all real episodes before them and the
-seconds of the training. The same command goes on where it was interrupted; another folder is
+that judge the recipe's live policy. The table has J_a of these, the costs of all real episodes before them, the
+seconds of the training, and the lines of code. The same command goes on where it was interrupted; another folder is
 another measurement.
 """
 
 import argparse
 import importlib
+import inspect
 import json
 import operator
 import shutil
@@ -285,8 +286,22 @@ class Comparison:
         done = env.paid[:-1]  # an episode begins when the last one has ended
         return Result(self.cost(Learned(learner, env)), sum(done), len(done), seconds)
 
+    def lines(self):
+        """Lines of code of each part, see :func:`code_lines`."""
+        wiring, law = (code_lines(getattr(self.recipe, name)) for name in ("real_system", self.system.classical))
+        recipe = code_lines(self.recipe) - wiring - law
+        predictive = code_lines(Predictive) + code_lines(self.system.rates) + code_lines(self.system.cost)
+        learner = code_lines(Environment) + code_lines(Learned) + code_lines(Comparison.learned)
+        return {"twinning": recipe, "classical": law, "do-mpc": predictive, "learner": learner, "wiring": wiring}
 
-def row(name, results):
+
+def code_lines(part):
+    """Number of lines of a part that are neither blank nor comments."""
+    lines = (line.strip() for line in inspect.getsource(part).splitlines())
+    return sum(bool(line) and not line.startswith("#") for line in lines)
+
+
+def row(name, results, lines):
     """A row of the table: over seeds, least and greatest cost and sum, and the median of the seconds."""
 
     def span(values, digits):
@@ -296,7 +311,7 @@ def row(name, results):
     costs, paid, episodes, seconds = zip(*results, strict=True)
     sums = span(paid, 3) if any(paid) else "–"
     time_taken = f"{statistics.median(seconds):.0f}" if any(seconds) else "–"
-    return f"| {name} | {len(results)} | {span(costs, 4)} | {sums} | {span(episodes, 4)} | {time_taken} |"
+    return f"| {name} | {len(results)} | {span(costs, 4)} | {sums} | {span(episodes, 4)} | {time_taken} | {lines} |"
 
 
 def main():
@@ -312,23 +327,24 @@ def main():
     torch.set_num_threads(1)
     comparison = Comparison(options.system, options.folder, options.judged)
     seeds, longer = range(options.seeds), range(options.long_seeds)
-    learner = options.learner
-    rows = [("twinning", comparison.twinning, seeds)]
-    rows += [(comparison.system.classical, comparison.classical, [0])]
-    rows += [("do-mpc, data sheet", comparison.data_sheet, [0])]
-    rows += [("do-mpc, coefficients of the twin", comparison.found, seeds)]
+    lines, learner = comparison.lines(), options.learner
+    rows = [("twinning", comparison.twinning, seeds, "twinning")]
+    rows += [(comparison.system.classical, comparison.classical, [0], "classical")]
+    rows += [("do-mpc, data sheet", comparison.data_sheet, [0], "do-mpc")]
+    rows += [("do-mpc, coefficients of the twin", comparison.found, seeds, "do-mpc")]
     if comparison.system.true:
-        rows += [("do-mpc, true coefficients", comparison.true, [0])]
+        rows += [("do-mpc, true coefficients", comparison.true, [0], "do-mpc")]
     for times, name, chosen in (
         (1, learner, seeds),
         (options.times, f"{learner}, {options.times} times the episodes", longer),
     ):
-        rows += [(name, partial(comparison.beside, times=times, algorithm=learner), chosen)]
-    print("| controller | seeds | J_a | Σ | real episodes | seconds |")
-    print("|---|---|---|---|---|---|")
-    for name, measure, chosen in filter(operator.itemgetter(2), rows):
+        rows += [(name, partial(comparison.beside, times=times, algorithm=learner), chosen, "learner")]
+    print("| controller | seeds | J_a | Σ | real episodes | seconds | lines of code |")
+    print("|---|---|---|---|---|---|---|")
+    for name, measure, chosen, part in filter(operator.itemgetter(2), rows):
         results = [comparison.kept(name, seed, measure) for seed in chosen]
-        print(row(name, results), flush=True)
+        print(row(name, results, lines[part]), flush=True)
+    print(f"\nAll but do-mpc's own model use the wiring of {lines['wiring']} lines.")
 
 
 if __name__ == "__main__":
