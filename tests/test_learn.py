@@ -451,3 +451,13 @@ def test_state_round_trip_samples_the_same():
 def test_an_episode_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="11 transitions at once do not fit a long-term memory of 10"):
         memory().store(labelled(list(range(11))), torch.ones(11))
+
+
+def test_a_critic_that_has_diverged_is_told_before_the_memory_takes_its_errors():
+    found, episode = learner(return_steps=1), explored(4)
+    with torch.no_grad():
+        for weight in found.critic_adam.weights:
+            weight.fill_(torch.nan)
+    with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
+        found.store(episode)
+    assert not len(found.memory)

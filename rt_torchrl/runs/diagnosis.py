@@ -89,12 +89,11 @@ def _classical(run: LoadedRun) -> Reason:
     remedy = "more twinning.planner.iterations and realisations, observations of what that controller reads, or it"
     summary = run.metrics["summary"]
     real, unseen = summary.get("real_unseen", {"controllers": {}})["controllers"], summary["unseen"]
-    others = {key: one["J_a"]["mean"] for key, one in unseen["baselines"].items()}
-    own, where = unseen[f"J_a_{run.live}"]["mean"], unseen["judged_on"]
+    judged, where = unseen["baselines"] | {run.live: {"J_a": unseen.get(f"J_a_{run.live}")}}, unseen["judged_on"]
     if run.live in real:
-        others = {key: one["J_a"]["mean"] for key, one in real.items() if key != run.live}
-        own, where = real[run.live]["J_a"]["mean"], "real system"
-    known = {key: cost for key, cost in others.items() if cost is not None}
+        judged, where = real, "real system"
+    known = {key: one["J_a"]["mean"] for key, one in judged.items() if one["J_a"] and one["J_a"]["mean"] is not None}
+    own = known.pop(run.live, None)
     if own is None or not known:
         return Reason(
             name, None, "no classical controller flew beside the policy, or the policy has no finite cost", remedy

@@ -292,9 +292,19 @@ class ActorCritic:
         self._traced = copy.deepcopy(policy)
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep the transitions of a real episode, with their TD errors as priorities."""
+        """Keep the transitions of a real episode, with their TD errors as priorities.
+
+        Raises:
+            ValueError: if a TD error is not finite in single precision, because the critic has diverged.
+        """
         transitions = self.transitions(episode)
-        self.memory.store(transitions, self.td_errors(transitions))
+        errors = self.td_errors(transitions)
+        if not errors.float().isfinite().all():
+            raise ValueError(
+                "the TD errors of an episode whose numbers are finite are not finite themselves: the critic has "
+                "diverged. Nothing was stored; use a smaller twinning.learner.reward_scale."
+            )
+        self.memory.store(transitions, errors)
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
         """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
