@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
-from rt_torchrl.steps.config import ROLES
+from rt_torchrl.steps.config import ROLES, Role
 
 GROUPS = {
     "cost": ("real_cost", "start_cost", "J_a_", "ended_after"),
@@ -42,14 +43,20 @@ class Dashboard:
         """
         for name, value in final_costs(summary).items():
             self.scalar(f"final/{name}", value)
+        unseen = summary["unseen"]
+        each = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
+        for name, costs in each.items():
+            if None not in costs:  # which stands for a cost that is not finite
+                self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(costs), 0)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
-    def episode(self, record: Mapping[str, Any]) -> None:
-        """Write the scalars and the words of an episode.
+    def episode(self, record: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
+        """Write the scalars and the words of an episode, and the weights after it.
 
         Args:
             record: entry of the episode in ``metrics.json``.
+            policies: both policies by role.
         """
         step = record["episode"]
         for tag, value in scalars_of(record).items():
@@ -57,6 +64,11 @@ class Dashboard:
         for tag, key in (("alarm", "warning"), ("believed", "believed")):
             if record.get(key):
                 self._writer.add_text(tag, str(record[key]), step)
+        weights = {f"closure/{name}": w for name, w in (record["closure"] or {}).items() if not isinstance(w, float)}
+        for role, policy in policies.items():
+            weights |= {f"{role}/{name}": weight.detach().cpu() for name, weight in policy.named_parameters()}
+        for name, values in weights.items():
+            self._writer.add_histogram(name, np.ravel(values), step)
 
     def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""

@@ -315,7 +315,7 @@ class Run:
         self.episodes.append(record)
         if short is not None:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
-        dashboard.episode(record)
+        dashboard.episode(record, self.algorithm.policies)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""
