@@ -163,7 +163,7 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     assert len(its.learner.memory) == len(ours.learner.memory) == 20
     assert clones(its.twin.closure, ours.twin.closure)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
-    assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].turns.pause > 1
+    assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.turns["late"].pause > 1
     assert resumed.algorithm.belief.flown
     assert_same(found, resumed.train())
     learned = whole.algorithm.policies["model_free"].parameters()
