@@ -116,7 +116,7 @@ def test_what_diverges_costs_infinitely(tmp_path):
     run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[1.0, NAN], curve=(NAN, 1.0)))
     assert run.cost == math.inf and run.curve == [math.inf, 1.0] and sum(run.real) == math.inf
     row = cells(Comparison("tanks", [Row(name="a", runs=[run], optimum=1.0)]).table())["a"]
-    assert row[2] == row[4] == "inf" and row[5] == "2"  # near the optimum after the second episode
+    assert row[2] == row[4] == row[5] == "inf" and row[6] == "2"  # near the optimum after the second episode
     comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()
 
 
