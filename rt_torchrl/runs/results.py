@@ -447,7 +447,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
     elif best is not None and cost >= known[best]:
-        steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
+        longer = "go on with --resume and more --episodes, or train with more --twinning.planner.iterations"
+        steps.append(f"{best} is better than the live policy: keep it, {longer}")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
     elif not alone:
