@@ -71,14 +71,14 @@ def test_torchrl_is_in_the_path_that_runs_by_default_which_goes_through_few_func
     sample = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "sample")
     refresh = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "update_tensordict_priority")
     adjoint, functions = counted(monkeypatch, torchdiffeq, "odeint_adjoint"), functions_of_episodes(monkeypatch)
-    algorithm = trained(tmp_path, "--episodes", "4").algorithm
+    algorithm = trained(tmp_path, "--episodes", "6").algorithm
     assert isinstance(algorithm, TensorDictSequential) and isinstance(algorithm.collector, BaseCollector)
-    # TD errors of five flights, and one trace of the critic's iteration and of the policy's, replayed 800 times.
-    assert len(loss) == 5 + 2
-    assert len(sample) == 4 * 2 * 2  # of four episodes with two phases, fifty batches at once
-    assert len(refresh) == 5 + 4 * 2
+    # TD errors of seven flights, and one trace of the critic's iteration and of the policy's, replayed 800 times.
+    assert len(loss) == 7 + 2
+    assert len(sample) == 6 * 2 * 2  # of six episodes with two phases, fifty batches at once
+    assert len(refresh) == 7 + 6 * 2
     assert not adjoint
-    # What is traced goes through the tracer in the first episode that needs it.
+    # What is traced goes through the tracer in the episode that needs it: early ones, as plans, beliefs and fits begin.
     usual = [seen for number, seen in functions.items() if number and not any(file == TRACER for file, _ in seen)]
     assert usual
     for seen in usual:
