@@ -195,6 +195,12 @@ def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for
     assert torch.equal(*weights)
     assert len(rig.flights) == 2 and "real_unseen" not in metrics["summary"]
     assert "random initial weights" in capsys.readouterr().out
+    # Controllers that fly where it does not are compared with no policy.
+    options = {"real_unseen": 2, "twinning": dataclasses.replace(SMALL, arm="model_free", learner=learner)}
+    found = run_on(machine(), tmp_path / "beside", baselines={"PD": PD, "mine": Tracking}, **options).train()["summary"]
+    flown = found["real_unseen"]["controllers"]
+    assert [*flown] == ["PD", "mine"] and not any("ratio" in one for one in flown.values())
+    assert "the live policy costs" not in capsys.readouterr().out
 
 
 def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
@@ -211,6 +217,9 @@ def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
     again = run_on(rig, tmp_path, real_unseen=2, resume=True).train()["summary"]
     assert len(rig.flights) == 2 + 2 and again["real_unseen"] == first["real_unseen"]
     assert again["cost_of_learning"] == first["cost_of_learning"]
+    # A controller that has not flown yet flies, and so does the policy beside it.
+    run_on(rig, tmp_path, real_unseen=2, resume=True, baselines={"mine": Tracking}).train()
+    assert len(rig.flights) == 2 + 2 + 2 * 2
 
 
 def test_after_an_interrupt_nothing_flies(tmp_path):

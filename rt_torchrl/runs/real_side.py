@@ -212,44 +212,54 @@ def announcement(names: Iterable[str], live: Role, count: int) -> str:
     return f"{count * len(called)} flights on the real system: {each}; they count as paid"
 
 
-def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:
+def entries(flights: Mapping[str, RealFlights], live: Role, J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:
     """The entry ``real_unseen`` of the summary.
 
     Args:
-        flights: flights by the name of the controller, of the live policy first if it flew.
+        flights: flights by the name of the controller.
+        live: name of the live policy, which need not have flown.
         J_p: costs of the twin on the flights of the live policy, by name; empty without such flights.
     """
-    first = next(iter(flights.values()))
     return {
         "controllers": {
-            name: {"episodes": len(one.judged.control_costs)} | one.judged.statistics() | beside(first, one)
+            name: {"episodes": len(one.judged.control_costs)}
+            | one.judged.statistics()
+            | (beside(flights[live], one) if live in flights else {})
             for name, one in flights.items()
         },
         "costs": {name: one.judged.control_costs.tolist() for name, one in flights.items()},
     } | {name: mean_with_confidence(costs) for name, costs in J_p.items()}
 
 
-def beside(first: RealFlights, other: RealFlights) -> dict[str, Any]:
-    """What the first controller costs over another one, where both flew the same episodes; nothing elsewhere.
+def beside(live: RealFlights, other: RealFlights) -> dict[str, Any]:
+    """What the live policy costs over another controller, where both flew the same episodes; nothing elsewhere.
 
-    ``ratio`` is that of the means, and ``cheaper`` the number of episodes in which the first one is cheaper.
+    ``ratio`` is that of the means, and ``cheaper`` the number of episodes in which the live policy is cheaper.
     """
-    same = torch.equal(first.flown.states[:, 0], other.flown.states[:, 0])
-    if first is other or not (same and torch.equal(first.flown.exogenous, other.flown.exogenous)):
+    same = torch.equal(live.flown.states[:, 0], other.flown.states[:, 0])
+    if live is other or not (same and torch.equal(live.flown.exogenous, other.flown.exogenous)):
         return {}
-    costs, others = first.judged.control_costs, other.judged.control_costs
+    costs, others = live.judged.control_costs, other.judged.control_costs
     return {"ratio": (costs.mean() / others.mean()).item(), "cheaper": int((costs < others).sum())}
 
 
-def judged_before(folder: Path, episodes: int, count: int) -> dict[str, Any] | None:
-    """The entry that an earlier end of a run has left after as many episodes, with so many flights; None without."""
+def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
+    """The entry that an earlier end of a run has left after as many episodes; None without.
+
+    Args:
+        folder: run folder.
+        episodes: number of episodes of the training.
+        names: names of the controllers that are to fly.
+        count: number of flights of each.
+    """
     if not (folder / "metrics.json").is_file():
         return None
     metrics = read_metrics(folder)
     found: dict[str, Any] | None = metrics["summary"].get("real_unseen")
     if found is None or len(metrics["episodes"]) != episodes:
         return None
-    return found if all(one["episodes"] == count for one in found["controllers"].values()) else None
+    flown = {name: one["episodes"] for name, one in found["controllers"].items()}
+    return found if flown == dict.fromkeys(names, count) else None
 
 
 def paid_before(folder: Path) -> list[float | None]:

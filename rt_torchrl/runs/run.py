@@ -333,15 +333,15 @@ class Run:
             return {}
         if len(self.episodes) < self.config.episodes and self.ended is None:
             return {}  # who has pressed Ctrl-C does not want the real system to go on
-        self._judged = real_side.judged_before(self.folder, len(self.episodes), self.config.real_unseen)
-        if self._judged:
-            bar.write("the real system has been flown after these episodes; it is not flown again")
-            return {}
         parts = self.initial_policies, self.baselines
         found = real_side.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
         live = self.algorithm.referee.live
         if self.config.real_unseen and live not in found:
             bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
+        self._judged = real_side.judged_before(self.folder, len(self.episodes), found, self.config.real_unseen)
+        if self._judged:
+            bar.write("the real system has been flown after these episodes; it is not flown again")
+            return {}
         if found:
             bar.write(real_side.announcement(found, live, self.config.real_unseen))
             bar.doing("judging on the real system")
@@ -382,12 +382,13 @@ class Run:
         return metrics
 
     def _real_results(self, real: dict[str, RealFlights]) -> dict[str, Any]:
-        flown, J_p = real.get(self.algorithm.referee.live), {}
+        live = self.algorithm.referee.live
+        flown, J_p = real.get(live), {}
         if flown is not None:
             on_it = self._on_the_real_system(flown.flown)
             costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
             J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
-        return real_side.entries(real, J_p)
+        return real_side.entries(real, live, J_p)
 
     def _pixels(self, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
         """Pixels of the figures of the training and of others, by name; each is drawn once."""
