@@ -83,10 +83,9 @@ def configuration(options: type[Options]) -> type[Options]:
             the option, its value, and what is allowed.
     """
     for name, declared in inspect.get_annotations(options).items():
-        inherited = (inspect.get_annotations(base).get(name) for base in options.__mro__[1:])
-        allowed = next((hint for hint in inherited if typing.get_origin(hint) is Annotated), None)
-        if allowed is not None and typing.get_args(allowed)[0] is declared:
-            options.__annotations__[name] = allowed
+        base = next((base for base in options.__mro__[1:] if name in inspect.get_annotations(base)), None)
+        if base is not None and typing.get_type_hints(base)[name] == declared:  # which are without what is allowed
+            options.__annotations__[name] = inspect.get_annotations(base)[name]
     made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)(options)
     validated = made.__init__
 

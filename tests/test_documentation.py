@@ -42,7 +42,9 @@ def leave_finished_run(folder):
         {"episode": k, "live": "model_based", "event": "keep", "real_cost": 0.1 - 0.01 * k, "J_p": 2.0, "seconds": {}}
         for k in range(2)
     ]
-    unseen = {"judged_on": "simulation", "baselines": {}, "merit": {"model_based": {}}}
+    unseen = {"judged_on": "simulation", "baselines": {}, "merit": {"model_based": {}}} | {
+        "J_a_model_based": {"mean": 0.09}
+    }
     summary = {"live": "model_based", "unseen": unseen, "twin": {"segment": 0}}
     write_json(folder / "metrics.json", {"episodes": episodes, "summary": summary})
     return folder

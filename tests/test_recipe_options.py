@@ -207,9 +207,10 @@ def test_an_option_that_a_recipe_declares_anew_keeps_what_its_base_allows():
     class Fewer(Example):
         count: int = 6
         rate: float = 0.5
+        widths: tuple[int, ...] = (4,)
 
     assert Fewer().count == 6 and Example().count == 1
-    for options in ({"count": 0}, {"rate": 2.0}):
+    for options in ({"count": 0}, {"rate": 2.0}, {"widths": (8, 0)}):
         with pytest.raises(ValueError, match="must be"):
             Fewer(**options)
 

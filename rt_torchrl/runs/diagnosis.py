@@ -11,6 +11,7 @@ from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.loaded_run import LoadedRun
+from rt_torchrl.runs.metrics import costs_at_the_end
 from rt_torchrl.steps.belief import NOISE
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
@@ -87,13 +88,7 @@ def _classical(run: LoadedRun) -> Reason:
     """Whether a classical controller was cheaper at the end, on the real system where it was flown."""
     name = "a classical controller is better"
     remedy = "more twinning.planner.iterations and realisations, observations of what that controller reads, or it"
-    summary = run.metrics["summary"]
-    real, unseen = summary.get("real_unseen", {"controllers": {}})["controllers"], summary["unseen"]
-    judged, where = unseen["baselines"] | {run.live: {"J_a": unseen.get(f"J_a_{run.live}")}}, unseen["judged_on"]
-    if run.live in real:
-        judged, where = real, "real system"
-    known = {key: one["J_a"]["mean"] for key, one in judged.items() if one["J_a"] and one["J_a"]["mean"] is not None}
-    own = known.pop(run.live, None)
+    own, known, where = costs_at_the_end(run.metrics["summary"])
     if own is None or not known:
         return Reason(
             name, None, "no classical controller flew beside the policy, or the policy has no finite cost", remedy

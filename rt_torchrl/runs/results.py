@@ -18,7 +18,7 @@ from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import on_the_twin
+from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -432,14 +432,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
     """
     found, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
-    unseen, live = found["unseen"], found["live"]
-    cost = unseen[f"J_a_{live}"]["mean"]
-    classical = {name: baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
-    real = {name: one["J_a"]["mean"] for name, one in found.get("real_unseen", {}).get("controllers", {}).items()}
-    twin = on_the_twin(unseen) and live not in real
-    if live in real:  # a cost on the twin is not compared with one on the real system
-        cost, classical = real.pop(live), real
-    known = {name: value for name, value in classical.items() if value is not None}
+    live, (cost, known, place) = found["live"], costs_at_the_end(found)
+    twin = place == "twin"
     best = min(known, key=known.__getitem__, default=None)
     call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
