@@ -298,13 +298,13 @@ class ActorCritic:
             ValueError: if a TD error is not finite in single precision, because the critic has diverged.
         """
         transitions = self.transitions(episode)
-        try:
-            self.memory.store(transitions, self.td_errors(transitions))
-        except FloatingPointError as error:
+        errors = self.td_errors(transitions)
+        if not errors.float().isfinite().all():
             raise ValueError(
-                f"the TD errors of an episode whose numbers are finite are not finite themselves ({error}): the critic "
-                "has diverged. Nothing was stored; use a smaller twinning.learner.reward_scale."
-            ) from error
+                "the TD errors of an episode whose numbers are finite are not finite themselves: the critic has "
+                "diverged. Nothing was stored; use a smaller twinning.learner.reward_scale."
+            )
+        self.memory.store(transitions, errors)
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
         """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
@@ -664,13 +664,9 @@ class LongTermMemory:
         return len(self.buffer)
 
     def store(self, transitions: TensorDictBase, td_errors: Float[Tensor, " n"]) -> None:
-        """Add transitions, a TensorDict of batch size n, with their TD errors δ.
-
-        Raises:
-            FloatingPointError: if one is not finite in single precision; nothing is then stored.
-        """
-        priorities = self._priorities(td_errors)
-        self._prioritise(self.buffer.extend(transitions.cpu()), priorities)
+        """Add transitions, a TensorDict of batch size n, with their TD errors δ."""
+        index = self.buffer.extend(transitions.cpu())
+        self.refresh(index, td_errors)
 
     def sample(self, count: int) -> TensorDictBase:
         """Draw transitions, with their ``index`` (for :meth:`refresh`) and importance weight ``priority_weight``."""
@@ -687,13 +683,10 @@ class LongTermMemory:
             FloatingPointError: if one is not finite in single precision, as after an update that has diverged; none is
                 then given.
         """
-        self._prioritise(index.cpu(), self._priorities(td_errors))
-
-    def _priorities(self, td_errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
         if not errors.isfinite().all():
             raise FloatingPointError("a TD error exceeds the range of single precision")
-        return (errors + TOL) ** self.prioritisation
+        self._prioritise(index.cpu(), (errors + TOL) ** self.prioritisation)
 
     def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
         self._writer.priorities[index.numpy()] = priorities.numpy()
