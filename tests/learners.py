@@ -11,10 +11,10 @@ processor. The same command goes on where it was interrupted; it takes 20 minute
 
 import argparse
 import dataclasses
-import json
 import statistics
 import sys
 import time
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -23,6 +23,7 @@ import numpy as np
 import stable_baselines3
 import torch
 from peers import Environment, Learned
+from ruler import kept
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
@@ -139,13 +140,10 @@ def main():
     parser.add_argument("--folder", type=Path, default=Path("runs/learners"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    options.folder.mkdir(parents=True, exist_ok=True)
     results = {}
     for seed, name, algorithm, implementation in product(range(options.seeds), SYSTEMS, ALGORITHMS, IMPLEMENTATIONS):
         file = options.folder / f"{name}-{algorithm}-{implementation}-{seed}.json"
-        if not file.exists():
-            file.write_text(json.dumps(train(name, algorithm, implementation, seed)))
-        result = json.loads(file.read_text())
+        result = kept(file, partial(train, name, algorithm, implementation, seed))
         results.setdefault((name, algorithm), {}).setdefault(implementation, []).append(result)
         print(file.stem, result, file=sys.stderr, flush=True)
     first, second = IMPLEMENTATIONS

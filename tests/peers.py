@@ -12,9 +12,7 @@ import importlib
 import inspect
 import json
 import operator
-import shutil
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -28,13 +26,13 @@ import gymnasium
 import numpy as np
 import stable_baselines3
 import torch
+from ruler import RECIPES, kept, span, train
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from torch import nn
 
 from rt_torchrl import control_cost, load_run
 from rt_torchrl.evaluation.unseen import RealEpisodes
 
-RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
 
 
@@ -216,12 +214,7 @@ class Comparison:
 
     def kept(self, row, seed, measure):
         """The result of a row, measured unless it is in the folder."""
-        file = self.folder / f"{row}, {seed}.json"
-        if not file.exists():
-            result = measure(seed)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(result))
-        result = Result(*json.loads(file.read_text()))
+        result = Result(*kept(self.folder / f"{row}, {seed}.json", partial(measure, seed)))
         print(f"{row}, seed {seed}: {result}", file=sys.stderr, flush=True)
         return result
 
@@ -232,17 +225,7 @@ class Comparison:
 
     def trained(self, seed):
         """The folder of the recipe's training with default options, and the seconds of its process."""
-        folder = self.folder / f"run-{seed}"
-        if not (folder / "seconds.json").exists():
-            shutil.rmtree(folder, ignore_errors=True)  # a training that was interrupted
-            folder.mkdir(parents=True)
-            command = [sys.executable, str(RECIPES / f"{self.name}.py"), "--seed", str(seed), "--threads", "1"]
-            command += ["--real-unseen", str(self.judged), "--no-figures", "--log-dir", str(folder)]
-            start = time.perf_counter()
-            with (folder / "training.log").open("w") as log:
-                subprocess.run(command, check=True, stdout=log, stderr=log)
-            (folder / "seconds.json").write_text(json.dumps(time.perf_counter() - start))
-        return folder
+        return train(self.name, ("--real-unseen", str(self.judged)), seed, self.folder / f"run-{seed}")
 
     def twinning(self, seed):
         folder = self.trained(seed)
@@ -303,11 +286,6 @@ def code_lines(part):
 
 def row(name, results, lines):
     """A row of the table: over seeds, least and greatest cost and sum, and the median of the seconds."""
-
-    def span(values, digits):
-        least, greatest = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
-        return least if least == greatest else f"{least} … {greatest}"
-
     costs, paid, episodes, seconds = zip(*results, strict=True)
     sums = span(paid, 3) if any(paid) else "–"
     time_taken = f"{statistics.median(seconds):.0f}" if any(seconds) else "–"

@@ -6,18 +6,16 @@ step of the simulator. What is in the folder is not done again.
 """
 
 import argparse
-import json
 import math
 import shlex
-import shutil
 import statistics
-import subprocess
-import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from ruler import kept, span, train
 
 from rt_torchrl import load_run
 from rt_torchrl.envs.wind_turbine import rosco as simulator
@@ -25,7 +23,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.systems.real_system import episode_seed
 
-RECIPE = Path(__file__).resolve().parent.parent / "recipes" / "wind_turbine.py"
 MEASURES = {
     "mean power [MW]": 4,
     "speed deviation [rad/s]": 3,
@@ -112,22 +109,10 @@ def rosco_flown(plant, seed, **tuning):
     return recorders[0].rows
 
 
-def trained(options, seed, folder):
-    """The run folder of a training."""
-    run = folder / "run"
-    if not (run / "metrics.json").exists():
-        shutil.rmtree(run, ignore_errors=True)  # a training that was interrupted
-        folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(RECIPE), "--task", "engineering", "--seed", str(seed), "--threads", "1"]
-        command += ["--no-figures", "--log-dir", str(run)]
-        with (folder / "training.log").open("w") as log:
-            subprocess.run([*command, *shlex.split(options)], check=True, stdout=log, stderr=log)
-    return run
-
-
 def learned(options, seed, folder, winds):
     """Means over episodes of the live policy of a training."""
-    run = load_run(trained(options, seed, folder))
+    words = ("--task", "engineering", *shlex.split(options))
+    run = load_run(train("wind_turbine", words, seed, folder / "run"))
     policy = run.policy(run.live)
     seeds = [episode_seed(UNSEEN_SEED, number) for number in range(winds)]
     return mean_over([measured(policy_flown(run.plant, policy, each)) for each in seeds])
@@ -141,22 +126,9 @@ def tuned(options, winds):
     return mean_over([measured(rosco_flown(WindTurbine(), seed, **tuning)) for seed in seeds])
 
 
-def kept(folder, winds, measure, *arguments):
-    """The measures in a folder, found first unless they are there."""
-    file = folder / f"winds-{winds}.json"
-    if not file.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(measure(*arguments, winds)))
-    return json.loads(file.read_text())
-
-
 def row(name, results):
     """A row of the table: each measure's least and greatest over seeds."""
-    cells = []
-    for measure, digits in MEASURES.items():
-        values = [float(f"{result[measure]:.{digits}g}") for result in results]
-        least, greatest = min(values), max(values)
-        cells.append(f"{least:g}" if least == greatest else f"{least:g} … {greatest:g}")
+    cells = [span([result[measure] for result in results], digits) for measure, digits in MEASURES.items()]
     return f"| {name} | {len(results)} | {' | '.join(cells)} |"
 
 
@@ -172,12 +144,17 @@ def main():
     torch.set_num_threads(1)
     print(f"| controller | seeds | {' | '.join(MEASURES)} |")
     print("|---" * (2 + len(MEASURES)) + "|")
+    file = f"winds-{options.winds}.json"
     for given in (*TUNINGS, *options.tuning):
         name = f"ROSCO {given}".strip()
-        print(row(name, [kept(options.folder / name, options.winds, tuned, given)]), flush=True)
+        result = kept(options.folder / name / file, partial(tuned, given, options.winds))
+        print(row(name, [result]), flush=True)
     for given, seeds in (("", options.seeds), *((each, options.also_seeds) for each in options.also)):
         folders = [options.folder / (given or "default") / str(seed) for seed in range(seeds)]
-        results = [kept(folder, options.winds, learned, given, seed, folder) for seed, folder in enumerate(folders)]
+        results = [
+            kept(folder / file, partial(learned, given, seed, folder, options.winds))
+            for seed, folder in enumerate(folders)
+        ]
         if not results:
             continue
         print(row(f"learned {given}".strip(), results), flush=True)

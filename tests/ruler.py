@@ -12,11 +12,12 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-RECIPES = Path(__file__).parent.parent / "recipes"
+RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 
 
 class Row(NamedTuple):
@@ -46,18 +47,33 @@ ROWS = {
 }
 
 
-def train(row: Row, seed: int, folder: Path) -> None:
+def train(recipe: str, options: Sequence[str], seed: int, folder: Path) -> Path:
     """Run the recipe, unless its results are there; ``seconds.json`` takes the seconds of the whole process."""
-    if (folder / "seconds.json").exists():
-        return
-    shutil.rmtree(folder, ignore_errors=True)  # a training that was interrupted
-    folder.mkdir(parents=True)
-    command = [sys.executable, str(RECIPES / f"{row.recipe}.py"), "--seed", str(seed), "--threads", "1"]
-    command += ["--no-figures", "--log-dir", str(folder), *row.options]
-    start = time.perf_counter()
-    with (folder / "training.log").open("w") as log:
-        subprocess.run(command, check=True, stdout=log, stderr=log)
-    (folder / "seconds.json").write_text(json.dumps(time.perf_counter() - start))
+    if not (folder / "seconds.json").exists():
+        shutil.rmtree(folder, ignore_errors=True)  # a training that was interrupted
+        folder.mkdir(parents=True)
+        command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--seed", str(seed), "--threads", "1"]
+        command += ["--no-figures", "--log-dir", str(folder), *options]
+        start = time.perf_counter()
+        with (folder / "training.log").open("w") as log:
+            subprocess.run(command, check=True, stdout=log, stderr=log)
+        (folder / "seconds.json").write_text(json.dumps(time.perf_counter() - start))
+    return folder
+
+
+def kept(file: Path, measure: Callable[[], Any]) -> Any:
+    """The result of a measurement, which a file keeps."""
+    if not file.exists():
+        result = measure()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(result))
+    return json.loads(file.read_text())
+
+
+def span(values: Sequence[float], digits: int = 5) -> str:
+    """Least and greatest value."""
+    least, greatest = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
+    return least if least == greatest else f"{least} … {greatest}"
 
 
 def identified(data: Path, folder: Path) -> float:
@@ -93,11 +109,6 @@ class Result(NamedTuple):
 
 def line(name: str, results: list[Result]) -> str:
     """A row of the table: least and greatest over seeds, alarms of all, and the median of the seconds."""
-
-    def span(values: list[float], digits: int = 5) -> str:
-        least, greatest = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
-        return least if least == greatest else f"{least} … {greatest}"
-
     live, cheaper, paid, alarms, seconds = (list(values) for values in zip(*results, strict=True))
     dearer = sum(one.live > 1.001 * one.cheaper for one in results)
     costs, time = f"{span(live)} | {span(cheaper)} | {dearer}", f"{statistics.median(seconds):.0f}"
@@ -118,7 +129,7 @@ def main() -> None:
         (name, seed): options.folder / name.replace(", ", "-") / f"{seed}" for name in options.rows for seed in seeds
     }
     with ThreadPoolExecutor(options.jobs) as pool:
-        running = {task: pool.submit(train, ROWS[task[0]], task[1], folder) for task, folder in tasks.items()}
+        running = {task: pool.submit(train, *ROWS[task[0]], *task[1:], folder) for task, folder in tasks.items()}
         for (name, seed), training in running.items():
             training.result()
             print(f"{name}, seed {seed}: {Result.of(tasks[name, seed])}", file=sys.stderr, flush=True)

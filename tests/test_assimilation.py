@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from seeds_and_numbers import seeded
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
@@ -13,7 +14,7 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
+from rt_torchrl.trajectories.trajectory import batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 WINDS = (1.0, -2.0)
@@ -45,16 +46,6 @@ def test_weights_are_those_of_a_regression_with_a_start_for_each_record():
     assimilation(Line(), fixed, initial="measured").update(records, [], 1, torch.Generator())
     # A standard error is 0.03 or so: the pinned start moves the slope by about as much.
     assert (fixed.w - closure.w).abs().max() > 0.02
-
-
-def test_nothing_is_drawn_from_a_record_without_noise():
-    plant = LinearQuadratic()
-    (segment,) = flown(plant, torch.Generator().manual_seed(0), (50,))
-    closure = plant.make_closure(torch.Generator().manual_seed(1))
-    found = assimilation(plant, closure).update([segment], [], 1, torch.Generator())
-    assert found.best < 1e-20 * found.start
-    # The loop ends at steps of 1e-9, or where little is left to gain.
-    torch.testing.assert_close(closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("initial", ["measured", "estimated"])
@@ -91,39 +82,19 @@ class Seasonal(LinearQuadratic):
         return super().vector_field(t, state, action * torch.cos(3.0 * t).unsqueeze(-1), exogenous, closure)
 
 
-def flight(plant, seed=0):
-    """A record of the true plant under random commands."""
-    generator = torch.Generator().manual_seed(seed)
-    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    command = 2.0 * torch.rand(1, plant.n_steps, 1, generator=generator, dtype=torch.float64) - 1.0
-    flown = Rollout(plant, plant.closure)(state, exogenous, command)
-    return Trajectory(flown.states[0].detach(), command[0], exogenous[0])
-
-
-def of_segments(plant, closure, **options):
-    options = {"inputs": "record", "iterations": 30, **options}
-    return Assimilation(DigitalTwin(plant, closure), AssimilationConfig(**options))
-
-
-def replayed(*records):
-    return Trajectory(*(torch.stack(x) for x in zip(*(r[:3] for r in records), strict=True)))
-
-
 def test_segments_start_at_their_own_time_and_state():
     """Two records of 50 intervals are cut into segments of 12; J_p is the mean of what a loop over them finds."""
     plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
-    records, expected = [flight(plant, seed) for seed in (0, 1)], []
+    records, expected = [flown(plant, seeded(seed), (50,))[0] for seed in (0, 1)], []
     for record in records:
         for first in range(0, 48, 12):
             part = slice(first, first + 12)
             rollout = Rollout(plant, closure)
             piece = record.states[None, first : first + 13]
-            flown = rollout(
-                piece[:, 0], record.exogenous[None, part], record.actions[None, part], start=first * plant.dt
-            )
-            expected.append(identification_cost(plant, flown, piece).item())
-    segments = replayed(*records).segments(12, plant.dt)
-    found = of_segments(plant, closure).likelihood(segments).normal_equations().cost.item()
+            given = piece[:, 0], record.exogenous[None, part], record.actions[None, part]
+            expected.append(identification_cost(plant, rollout(*given, start=first * plant.dt), piece).item())
+    segments = batch_of(records).segments(12, plant.dt)
+    found = assimilation(plant, closure, initial="measured").likelihood(segments).normal_equations().cost.item()
     assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
 
 
@@ -153,8 +124,3 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     (error,) = fit.standard_errors([record]).values()
     assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
-
-
-def test_a_bad_segment_is_refused():
-    with pytest.raises(ValueError, match="segment=-1"):
-        AssimilationConfig(segment=-1)

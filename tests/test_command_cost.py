@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from scipy.optimize import lsq_linear
 
 from rt_torchrl.control.command_cost import PENALTY, CommandCost, descend
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -50,39 +49,11 @@ def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
 
 
-def test_commands_beyond_a_rate_limit_have_a_gradient():
-    plant, generator = WindTurbine(), torch.Generator().manual_seed(0)
-    state, exogenous = plant.draw_initial_state(1, generator)[0], plant.draw_exogenous(1, generator)[0, :2]
-    plan = np.full((2, 2), 1.0)  # both actuators start far below, at their last actions
-    # The torque of the second interval is within its limit; all others are beyond.
-    without = by_rollout(plant, plan, state, exogenous, penalty=0.0)[1]
-    assert (without[0] == 0.0).all() and without[1, 1] == 0.0
-    cost = CommandCost(plant, constant(plant.closure), 2)
-    cost.begin(state, exogenous)
-    assert (cost(plan)[1] > 0.0).all()
-
-
 def test_a_cost_without_finite_ranges_is_refused():
     plant = LinearQuadratic()
     plant.actions = (Signal(symbol="a", name="force", unit="N"),)
     with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
         CommandCost(plant, plant.closure, 10)
-
-
-def test_the_descent_solves_a_bounded_least_squares_problem():
-    rng = np.random.default_rng(0)
-    matrix, target = rng.normal(size=(30, 12)), 3.0 * rng.normal(size=30)
-    wanted = lsq_linear(matrix, target, bounds=(0.0, 1.0), tol=1e-14)
-    assert (wanted.active_mask != 0).any() and (wanted.active_mask == 0).any()
-
-    def evaluate(point):
-        rest = matrix @ point.ravel() - target
-        return 0.5 * float(rest @ rest), (matrix.T @ rest).reshape(point.shape)
-
-    found = descend(evaluate, np.full((6, 2), 0.5), iterations=1000, tolerance=0.0)
-    np.testing.assert_allclose(found.point.ravel(), wanted.x, atol=1e-6)
-    np.testing.assert_allclose(found.cost, wanted.cost, rtol=1e-10)
-    np.testing.assert_array_equal(found.gradient, evaluate(found.point)[1])
 
 
 def test_a_descent_goes_round_points_where_the_cost_is_not_finite():

@@ -18,7 +18,6 @@ from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 
 V_T, A_S, A_HX, M_C = 60.0, 74.1, 200 * math.pi * 0.005 * 2, 500e3
 U_S, U_HX, K_JT = 50.0, 75.0, 500e9
-LIGHT_WALL = 20e3  # [J/K]
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 
 
@@ -157,8 +156,6 @@ def test_a_pressure_beyond_the_table_is_a_divergence(plant):
     load = torch.full((1, 100, 1), 1e6, dtype=torch.float64)
     with pytest.raises(DivergenceError, match="cryogenic_tank.*diverged"):
         flown(plant, (895e3,), 0.0 * load, load, 100)
-    with pytest.raises(ValueError, match="p=950 kPa"):
-        plant.state_at(double(950e3))
 
 
 # Closure, policy, costs

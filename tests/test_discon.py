@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from c_build import COMPILER, library, needs_compiler
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from printed_commands import TEXTS, blocks
 from seeds_and_numbers import seeded
 
-from rt_torchrl import DISCON, StateFeedback, export_discon, shipped_plants
+from rt_torchrl import DISCON, StateFeedback, export_discon
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -306,14 +306,3 @@ def test_the_code_of_the_page_prints_what_it_says(capfd):
 
 
 # What is exported, and what is not.
-
-
-def test_a_policy_that_needs_more_than_the_swap_array_is_refused(tmp_path):
-    preview, tank = WindTurbine(observe=("preview",)), shipped_plants()["cryogenic_tank"]()
-    with pytest.raises(ValueError, match=r"not give wind_speed_in_2_s \[m/s\], wind_speed_in_4_s \[m/s\], wind_sp"):
-        export_discon(preview.make_policy(seeded()), tmp_path / "discon.c", preview)
-    with pytest.raises(ValueError, match="'cryogenic_tank' has the actions .*; a DISCON demands generator_torque and"):
-        export_discon(tank.make_policy(seeded()), tmp_path / "discon.c", tank)
-    with pytest.raises(ValueError, match="must end in .c"):
-        export_discon(LinearGain([[1.0]]), tmp_path / "discon.so", preview)
-    assert not list(tmp_path.iterdir())

@@ -42,28 +42,6 @@ def imitation():
     return Imitation(Belief({}, virtual), 5)
 
 
-def distilled(live, idle):
-    seen = torch.randn(300, 2, generator=seeded(3), dtype=torch.float64)
-    return imitation().imitate(live, idle, seen=seen, draw=draw)
-
-
-def test_a_perceptron_learns_an_affine_law():
-    """The clone agrees on observations that it has not been shown, and costs as much as the teacher."""
-    live, idle = affine([-0.8, -1.1]), perceptron()
-    before = weights(live)
-    found = distilled(live, idle)
-    points = torch.randn(500, 2, generator=seeded(5), dtype=torch.float64)
-    # By hand, as a share of the range of 4 N: the library's own error is on other points.
-    error = ((live(points) - idle(points)) / 4.0).square().mean().sqrt().item()
-    # The law is a perceptron of one unit; sixteen of them come within some thousandths of it in 400 gradients.
-    assert found < 5e-3 and error < 1e-2, (found, error)
-    assert torch.equal(before, weights(live))
-    twin = DigitalTwin(PLANT, PLANT.closure)
-    costs = [twin.cost(policy, *draw(seed=4)).item() for policy in (live, idle)]
-    # J_a is stationary nowhere near this law, so that a difference of the actions of 0.2 % of 4 N shows as such.
-    assert costs[1] == pytest.approx(costs[0], rel=1e-2)
-
-
 def two_architectures(**options):
     options = {"learner": LEARNING, "referee": RefereeConfig(clone_patience=0), **options}
     policies = {"model_free": perceptron(), "model_based": affine([-0.8, -1.1])}

@@ -4,7 +4,6 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.plants.sampling import rk4_step
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 
@@ -18,20 +17,6 @@ def uniform_actions(env, seed):
     low, high = env.action_spec.space.low, env.action_spec.space.high
     share = torch.rand(low.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return low + share * (high - low)
-
-
-def test_step_is_one_runge_kutta_step_of_the_true_system():
-    plant = LinearQuadratic()
-    env = PlantEnv(plant, seed=1)
-    found = env.reset()
-    action = uniform_actions(env, 0)
-    done = act(env, found, action)
-    matrix = sum(torch.tensor(m, dtype=torch.float64) for m in (plant.A, plant.true_closure))
-    force = torch.cat([torch.zeros(1, 1, dtype=torch.float64), action + found["exogenous"]], -1)
-    expected = rk4_step(lambda t, s: s @ matrix.T + force, torch.tensor(0.0), found["state"], plant.dt)
-    # The same sums in another order.
-    torch.testing.assert_close(done["next", "state"], expected, rtol=1e-13, atol=1e-14)
-    assert torch.equal(done["next", "applied"], action)
 
 
 class Clock(LinearQuadratic):
@@ -90,27 +75,3 @@ def test_sensors_err_by_a_share_of_what_they_read():
     # On this plant the observation is the state, and what is read at the end of a step is what the next one sees.
     assert torch.equal(read["observation"], read["state"])
     assert torch.equal(read["next", "state"][:-1], read["state"][1:])
-
-
-def test_the_real_system_wears_from_episode_to_episode():
-    plant = LinearQuadratic()
-    worn = [LinearClosure(torch.full((2, 2), -0.1 * k)) for k in range(3)]
-    env, ends = PlantEnv(plant, seed=1, wear=lambda episode: worn[episode]), []
-    for k in range(3):
-        env.reset()
-        found = env.reset()  # as a collector does; no episode was flown in between
-        done = act(env, found, torch.zeros(1, 1).double())
-        assert env.closure is worn[k]
-        t, z = torch.zeros(1).double(), found["exogenous"]
-        expected = plant.step(t, found["state"], torch.zeros(1, 1).double(), z, worn[k]).state
-        torch.testing.assert_close(done["next", "state"], expected, rtol=1e-14, atol=1e-14)
-        ends.append(env.state_dict()["episodes"])
-    assert ends == [1, 2, 3]
-    env.load_state_dict({**env.state_dict(), "episodes": 1})
-    act(env, env.reset(), torch.zeros(1, 1).double())
-    assert env.closure is worn[1]
-
-
-def test_noise_out_of_range_is_refused():
-    with pytest.raises(ValueError, match="noise=1.5 "):
-        PlantEnv(LinearQuadratic(), noise=1.5)

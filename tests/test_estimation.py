@@ -85,19 +85,6 @@ def test_a_line_with_holes_is_fitted_as_by_regression():
     np.testing.assert_allclose(found.uncertainty.initial_errors()[:, 0].numpy(), errors[:2], rtol=0.01)
 
 
-def test_a_bias_is_told_from_the_state():
-    """Two sensors of one position, one of which is off by a constant: the difference of their means."""
-    plant = Line()
-    (sensor,) = sensors_of(plant, ["position"])
-    sensors = sensor, Sensor(measurement=sensor.measurement, noise=0.1, bias=True)
-    record = sensor_record(plant, sensors, line_segment(1.0 + 0.05 * np.arange(50)))
-    noise = torch.stack([0.1 * torch.from_numpy(noise_of(50, k)) for k in (0, 1)], -1)
-    readings = record.readings + noise + torch.tensor([0.0, 0.7])
-    found = Estimation(DigitalTwin(plant, Slope()), sensors).run([record._replace(readings=readings)])
-    expected = (readings[:, 1] - readings[:, 0]).mean().item()
-    assert found.likelihood.biases()[1].item() == pytest.approx(expected, abs=1e-6)
-
-
 def test_a_room_is_identified_through_its_air_with_its_uncertainty():
     """The hidden start of the wall is an unknown: 60, 90 and 4 come out, as a fit that guesses it does not find."""
     plant, sensors, records = room_records()

@@ -14,7 +14,7 @@ from torch import nn
 from rt_torchrl import export_c, shipped_plants
 from rt_torchrl.export import c_file
 from rt_torchrl.export.c_file import c_array
-from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.programs.c_source import CSource, literal
 from rt_torchrl.programs.rules import new_tracer
@@ -37,22 +37,6 @@ def called(function, observation, n_actions):
     action = c_array([0.0] * n_actions)
     function(c_array(observation), action)
     return torch.tensor(action, dtype=torch.float64)
-
-
-@needs_compiler
-def test_an_affine_law_is_its_closed_form(tmp_path):
-    plant = shipped_plants()["wind_turbine"]()
-    policy = SaturatedAffine(2, plant.actions, generator=seeded())
-    with torch.no_grad():
-        policy.linear.weight.copy_(torch.tensor([[1.0, -2.0], [0.5, 3.0]]))
-        policy.linear.bias.copy_(torch.tensor([0.25, -1.0]))
-    export_c(policy, tmp_path / "policy.c", plant)
-    function = library(tmp_path / "policy.c").wind_turbine_policy
-    torque, pitch = called(function, [0.3, 0.1], 2).tolist()
-    assert torque == pytest.approx(0.5 * (math.tanh(0.3 - 0.2 + 0.25) + 1.0) * 43_093.55, rel=ROUNDING)
-    assert pitch == pytest.approx(0.5 * (math.tanh(0.15 + 0.3 - 1.0) + 1.0) * 30.0, rel=ROUNDING)
-    # Saturated, and beyond what exp can hold.
-    assert called(function, [1e6, -1e6], 2).tolist() == [43_093.55, 0.0]
 
 
 @needs_compiler
@@ -170,17 +154,6 @@ def test_activations_and_normalisations(tmp_path):
     plant = plant_of(2, named(policy.every(torch.zeros(1, 2, dtype=torch.float64))))
     assert export_c(policy, tmp_path / "layers.c", plant) < ROUNDING
     assert library(tmp_path / "layers.c").linear_quadratic_policy
-
-
-@needs_compiler
-def test_a_broken_sensor_is_not_hidden(tmp_path):
-    activations = nn.ReLU(), nn.Hardtanh(), nn.Softplus(), nn.ReLU6(), nn.LeakyReLU(), nn.ELU()
-    policy = Formula(lambda e, W, b: torch.cat([module(e) for module in activations] + [torch.maximum(e, b[:2])], -1))
-    export_c(policy, tmp_path / "policy.c", plant_of(2, unbounded(14)), function="act")
-    found = called(library(tmp_path / "policy.c").act, [math.nan, 0.5], 14)
-    assert found[::2].isnan().all()
-    expected = policy(torch.tensor([[0.5, 0.5]], dtype=torch.float64))[0, 1::2]
-    torch.testing.assert_close(found[1::2], expected.detach(), rtol=ROUNDING, atol=0)
 
 
 @pytest.mark.parametrize("number", [0.1, -1 / 3, 1e-300, 43_093.55, -0.0, math.inf, -math.inf, 5e-324, 1.7e308])

@@ -7,8 +7,7 @@ import re
 import pytest
 import torch
 from c_build import library, needs_compiler
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from scipy.linalg import expm
+from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import seeded
 
 from rt_torchrl import export_controller, export_twin, shipped_plants
@@ -269,18 +268,3 @@ def test_twins_of_the_plants(name, kind, tmp_path):
             state = plant.step(t, state, middle, exogenous[:, k], closure).state
     assert state.isfinite().all()
     torch.testing.assert_close(found, state[0], rtol=CLOSE, atol=CLOSE)
-
-
-@needs_compiler
-def test_a_linear_twin_against_the_matrix_exponential(tmp_path):
-    matrix = [[0.05, 0.0], [-0.4, 0.2]]
-    plant = LinearQuadratic(dt=0.01)
-    export_twin(LinearClosure(matrix), tmp_path / "twin.c", plant, name="twin")
-    A, B, C, D = (torch.tensor(x, dtype=torch.float64) for x in (plant.A, plant.B, matrix, plant.D))
-    block = torch.zeros(4, 4, dtype=torch.float64)
-    block[:2] = torch.cat([A + C, B, D], 1)
-    start = [0.7, -0.4, 1.5, 0.3]
-    exact = torch.from_numpy(expm(0.01 * block.numpy()))[:2] @ torch.tensor(start, dtype=torch.float64)
-    found = build(tmp_path / "twin.c")(0.0, start[:2], start[2:3], start[3:])
-    # One step of the fourth order.
-    torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01**5)

@@ -331,9 +331,3 @@ def test_motions_by_hand(kind, size, asked, means, ends):
         acting, position = plant.respond(position, torch.tensor([action]).double(), plant.closure)
         found.append((acting.item(), position.item()))
     assert [mean for mean, _ in found] == pytest.approx(means) and [end for _, end in found] == pytest.approx(ends)
-
-
-@pytest.mark.parametrize("kind", [RateLimitedActuator, PlayActuator, StickingActuator])
-def test_a_size_that_is_none_is_refused(kind):
-    with pytest.raises(ValueError, match=r"size=0.0 N(/s)? of force must be positive and finite"):
-        kind(LinearQuadratic(), "force", 0.0)

@@ -202,15 +202,6 @@ def test_continuous_adjoint_agrees(plant, driver):
     assert_equal(reference, exact, 2e-5)
 
 
-def test_continuous_adjoint_of_a_linear_system_is_exact_but_for_the_weights():
-    """The step of the transposed matrix is the transposed step: states and inputs have the discrete gradient."""
-    case = Case(LinearQuadratic(dt=0.1, horizon=4.0), "own", "commands", 4)
-    exact, reference = case.gradients("parallel"), case.gradients("odeint_adjoint")
-    assert_equal(
-        reference, {name: exact[name] for name in ("initial_state", "exogenous", "command")}, 1e-13
-    )  # rounding
-
-
 @pytest.mark.parametrize("driver", ["perceptron", "commands"])
 def test_products_are_made_in_pieces(driver, monkeypatch):
     """The tape holds at most 50 of 160 intervals at a time; the gradients are exact and equal those of one piece."""

@@ -10,7 +10,6 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, flown, line_segment
 from test_export_recipe import recipe
 
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
@@ -36,23 +35,6 @@ ROBUST = EstimationConfig(errors="robust")
 def cost_records(plant, segments):
     """What J_p compares along segments."""
     return [sensor_record(plant, state_sensors(plant), segment) for segment in segments]
-
-
-@pytest.mark.parametrize("kind", [LinearQuadratic, FlappingWing, WindTurbine])
-def test_the_likelihood_of_the_states_with_the_noise_of_their_scales_is_the_cost(kind):
-    """J_p over segments of different lengths and starts, from first states that are moved."""
-    plant = kind() if kind is LinearQuadratic else kind(horizon=40 * kind().dt)
-    generator = torch.Generator().manual_seed(0)
-    segments = flown(plant, generator, (12, 7, 20))
-    twin = DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
-    likelihood = Estimation(twin, state_sensors(plant)).likelihood(cost_records(plant, segments))
-    with torch.no_grad():
-        likelihood.initial.offsets[:, 0].normal_(0.0, 0.01, generator=generator)
-    cost = 0.0
-    for (states, actions, exogenous, start, _), first in zip(segments, likelihood.initial(), strict=True):
-        again = twin.replay(first[None], exogenous[None], actions[None], start=start)
-        cost = cost + plant.dt * plant.discrepancy(again.states[0], states).sum()
-    assert likelihood.normal_equations().cost.item() == pytest.approx(cost.item(), rel=1e-12)
 
 
 def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise():
@@ -325,14 +307,3 @@ def test_an_own_plant_is_made_by_its_file_or_its_recipe(tmp_path):
         assert own.horizon == faster.horizon
     with pytest.raises(ValueError, match="cannot be made .*blades.*its options must have defaults"):
         identify.Config(log=file, plant=f"{file}:Demanding").make_plant()
-
-
-def test_what_cannot_be_recorded_is_refused(tmp_path):
-    record = recipe("record_log")
-    for options, message in (
-        ({"plant": "windmill"}, "windmill"),
-        ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5"),
-        ({"plant": "wind_turbine", "states": ("rotor_speed", "foo")}, r"states=\['foo'\].*choose of rotor_speed"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            record.Config(log=tmp_path / "log.csv", **options)

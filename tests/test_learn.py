@@ -19,7 +19,6 @@ from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, Iteration, Learn
 from rt_torchrl.trajectories.rollout import Rollout
 
 GAMMA = 0.9
-GAMMA_IN_TORCHRL = torch.tensor(GAMMA, dtype=torch.float32).item()  # DDPGLoss keeps it in single precision
 PLANT = LinearQuadratic()
 HALF_RANGE = 2.0  # of the force; its middle is zero
 
@@ -105,11 +104,6 @@ def values(found, observation, action, *, target=False):
         with of_one.to_module(network):
             of_each.append(network(pairs.copy())["state_action_value"])
     return torch.stack(of_each)
-
-
-def cost_to_go(found, observation):
-    """−q(e, π(e)) of the lowest value."""
-    return -values(found, observation, found.policy(observation) / HALF_RANGE).amin(0).squeeze(-1)
 
 
 def assert_equal(state, other):
@@ -306,18 +300,6 @@ def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, orde
     assert sizes == [350, 200] if algorithm == "ddpg" else [350]
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "sac"])
-def test_all_is_drawn_from_the_learners_generator(algorithm):
-    errors = []
-    for _ in range(2):
-        torch.manual_seed(np.random.default_rng().integers(2**31))
-        found, data = learner(algorithm), scaled(explored(10))
-        state = torch.get_rng_state()
-        errors.append(found.td_errors(data))
-        assert torch.equal(state, torch.get_rng_state())
-    assert torch.equal(*errors)
-
-
 @pytest.mark.parametrize(
     ("algorithm", "updates", "spread", "options"),
     [
@@ -370,11 +352,6 @@ def test_rewards_are_summed_over_whole_windows_only():
     assert found["next", "reward"].flatten().tolist() == pytest.approx([2.75, 4.5], rel=1e-6)
     assert found["next", "observation"][:, 0].tolist() == [3.0, 4.0]
     assert found["steps_to_next_obs"].flatten().tolist() == [3, 3]
-
-
-def test_a_window_longer_than_an_episode_is_refused():
-    with pytest.raises(ValueError, match=r"return_steps=1000000 exceeds the \d+ control intervals"):
-        summing(1_000_000)
 
 
 def test_the_target_discounts_by_the_steps_it_has_summed():

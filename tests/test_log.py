@@ -87,41 +87,6 @@ def test_dates_are_counted_from_the_first_row(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "table, columns, message",
-    [
-        (TABLE, [], "no column 'time'"),
-        (TABLE, ["when=time"], "column 'when' for 'time'"),
-        (TABLE, ["t=clock"], "has the signals time, position"),
-        (TABLE, ["t=time", "x_mm=position", "velocity=position"], "name a signal twice"),
-        (TABLE, ["t=time", "note=position"], "an entry that is not a number"),
-        ("time,force\n0,1\n0.1,1\n", [], "no column disturbance"),
-        (TABLE.replace("100,", "0,"), ["t=time"], "row 1 of the log .* the same time"),
-        (TABLE.replace("250,", "50,"), ["t=time"], "row 2 of the log .* an earlier time"),
-        (TABLE.replace("100,", ",", 1), ["t=time"], "1 of them without a time"),
-        (TABLE.replace("-1,0.5", ",0.5"), MAPPING, "force is nan N in row 2"),
-        (TABLE.replace("-1,0.5", "-2.5,0.5"), MAPPING, "force is -2.5 N in row 2 .* from -2 to 2 N"),
-        (TABLE.splitlines()[0] + "\n", ["t=time"], "0 rows"),
-        ("time,force\n2024-03-31,1\n2024-04-01,1\n", ["time=time[s]"], "holds dates; leave its unit 's' away"),
-        ("time;force\n0;1\n0.1;1\n", [], "no column 'time'; it has time;force"),
-        ("time,force,force\n0,1,2\n0.1,1,2\n", [], "'force' is there 2 times in .* columns time, force, force"),
-        ("time,f, f\n0,1,2\n0.1,1,2\n", ["f=force"], "column 'f' for 'force' is there 2 times"),
-        ("time,force\n0,1\n0.1\n", [], "line 3 has 1 entries; the header has 2: time, force"),
-        ("time,force\n0,1,7\n0.1,1,8\n", [], "line 2 has 3 entries; the header has 2: time, force"),
-        (",\n1,2\n", [], "it has no header"),
-        ("time,force\n0.0,1\n0.1,1\nend,1\n", [], "column 'time' .* not a number: 'end' in row 2"),
-        ("time,force\n0,1\n1,1,\n2,off\n", [], "column 'force' .* not a number: 'off' in row 2"),
-        ("time,force\n2024-03-31,1\nend,1\n", [], r"not a date .* 'end' in row 1 \(counted from 0\), 1 such rows"),
-        ("time,force\n2024-03-31T00:00Z,1\n2024-03-31T00:05,1\n", [], "an offset from UTC, .* 'T?2024-03-31T00:05'"),
-    ],
-)
-def test_logs_that_cannot_drive_a_twin_are_refused(tmp_path, table, columns, message):
-    (tmp_path / "log.csv").write_text(table)
-    declared = [column if isinstance(column, Column) else Column.parse(column) for column in columns]
-    with pytest.raises(ValueError, match=message):
-        checked(read_log(tmp_path / "log.csv", PLANT, declared), PLANT)
-
-
-@pytest.mark.parametrize(
     "change",
     [
         lambda text: text.replace("\n", ",\n"),

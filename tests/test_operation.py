@@ -1,6 +1,6 @@
 """Operation while learning: windows and orders in the process of the test, and in a process of their own."""
 
-import math
+import contextlib
 import multiprocessing
 import os
 
@@ -123,12 +123,6 @@ def test_the_handover_keeps_the_actuators_own_rate(monkeypatch):
     torch.testing.assert_close(applied[20:], action[20:])
 
 
-@pytest.mark.parametrize("speed", [0.0, math.inf])
-def test_impossible_options_are_refused(speed):
-    with pytest.raises(ValueError, match="speed="):
-        OperationConfig(speed=speed)
-
-
 # Operation while learning, together with limits and faults.
 
 
@@ -235,10 +229,18 @@ def endless():
     return RealSystem(PlantEnv(LinearQuadratic(horizon=300.0)), SHORT, applied=Reading(keys=("applied",)), **places)
 
 
+@contextlib.contextmanager
 def operation(make_env, **options):
+    """An operation that flies its first window by the first of two constant policies, which ends with the block."""
     policies = {"one": Constant(0.5), "two": Constant(-0.5)}
     config = OperationConfig(speed=10.0, **options)
-    return Operation(Operator(make_env, SHORT, policies, QUIET, config, seed=1), make_env()), policies
+    found = Operation(Operator(make_env, SHORT, policies, QUIET, config, seed=1), make_env())
+    try:
+        found.hand_over("one", policies["one"], strength=0.0)
+        assert found.rollout()["version"].eq(0).all()
+        yield found, policies["two"]
+    finally:
+        found.close()
 
 
 @pytest.mark.parametrize(
@@ -257,17 +259,12 @@ def test_the_learner_leaves_a_core_to_what_acts(options, expected, monkeypatch):
 
 @pytest.mark.slow
 def test_a_policy_takes_over_in_the_other_process_without_a_bump():
-    found, policies = operation(endless, continuous=True)
-    try:
-        found.hand_over("one", policies["one"], strength=0.0)
-        found.rollout()
-        found.hand_over("two", policies["two"], strength=0.0)
+    with operation(endless, continuous=True) as (found, other):
+        found.hand_over("two", other, strength=0.0)
         window = found.rollout()
         while window["version"].max() < 1:
             window = found.rollout()
         window = torch.cat([window, found.rollout()], 1)[0]
-    finally:
-        found.close()
     action = window["action"].flatten()
     # A range of 4 N in 20 intervals is 0.2 N an interval.
     assert action[0] == 0.5 and action[-1] == -0.5 and action.diff().abs().max() <= 0.2 + 1e-12
@@ -277,23 +274,15 @@ def test_a_policy_takes_over_in_the_other_process_without_a_bump():
 
 @pytest.mark.slow
 def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_on():
-    found, policies = operation(breaking)
-    try:
-        found.hand_over("one", policies["one"], strength=0.0)
-        assert found.rollout()["version"].eq(0).all()
+    with operation(breaking) as (found, _):
         with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
             found.rollout()
         assert raised.value.flown.shape == (1, 4) and found.rollout().shape == (1, 10)
-    finally:
-        found.close()
 
 
 @pytest.mark.slow
 def test_an_acting_process_that_was_killed_is_said():
-    found, policies = operation(endless)
-    try:
-        found.hand_over("one", policies["one"], strength=0.0)
-        found.rollout()
+    with operation(endless) as (found, other):
         (process,) = multiprocessing.active_children()
         process.kill()
         process.join()
@@ -301,9 +290,7 @@ def test_an_acting_process_that_was_killed_is_said():
             while True:  # windows that came before
                 found.rollout()
         with pytest.raises(RuntimeError, match="the acting process has ended without a word"):
-            found.hand_over("two", policies["two"], strength=0.0)
-    finally:
-        found.close()
+            found.hand_over("two", other, strength=0.0)
 
 
 @pytest.mark.slow
@@ -322,8 +309,8 @@ def test_a_run_goes_on_after_a_stop(tmp_path):
     ],
 )
 def test_what_cannot_operate_is_refused(make_env, continuous, message):
-    with pytest.raises(ValueError, match=message):
-        operation(make_env, continuous=continuous)
+    with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
+        pass
 
 
 def test_a_real_system_that_only_the_learner_has_is_refused(tmp_path):

@@ -100,15 +100,6 @@ def test_default_episode_is_a_whole_number_of_steps(kind):
             kind(**{"dt": plant.dt, "horizon": plant.horizon, **change})
 
 
-def test_episodes_and_policies_are_drawn(plant):
-    """A problem may fix its start, and a closure its first coefficients; inputs, where there are some, are drawn."""
-    one, other = (plant.draw_exogenous(2, seeded(seed)) for seed in (1, 2))
-    if plant.inputs:
-        assert not torch.equal(one, other) and not torch.equal(one[0], one[1])
-    policies = [list(plant.make_policy(seeded(seed)).parameters()) for seed in (1, 2)]
-    assert any(not torch.equal(a, b) for a, b in zip(*policies, strict=True))
-
-
 def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     plant = shortened(kind, GREATEST_EPISODE)
     episode, policy = fly(plant)
@@ -140,11 +131,6 @@ def test_episode_is_truncated_at_the_horizon_and_never_terminated(plant):
     last[:, -1] = True
     assert torch.equal(episode["next", "truncated"], last) and torch.equal(episode["next", "done"], last)
     assert not episode["next", "terminated"].any()
-
-
-def test_environment_is_seeded(plant):
-    flights = [fly(plant, seed=seed)[0]["next", "state"] for seed in (7, 7, 8)]
-    assert torch.equal(flights[0], flights[1]) and not torch.equal(flights[0], flights[2])
 
 
 # Every plant, policy, closure and extension that is shipped becomes machine code: nothing in it is refused.

@@ -8,11 +8,9 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from printed_commands import blocks
-from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
 
-from rt_torchrl import PlannerConfig, RunConfig, TwinningConfig
 from rt_torchrl.control.forecasts import Decaying
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -22,7 +20,6 @@ from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import control_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
 
@@ -43,15 +40,6 @@ def control(plant=PLANT, closure=None, **options):
 )
 def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode(dt, horizon, hold, expected):
     assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
-
-
-def test_a_window_that_does_not_fit_is_refused_by_the_name_of_its_option():
-    planner = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=0.25))
-    config = RunConfig(twinning=TwinningConfig(planner=planner))
-    with pytest.raises(
-        ValueError, match=r"twinning\.planner\.receding_horizon: horizon=0.25 s must be a whole multiple"
-    ):
-        config.acting_policies({}, PLANT, PLANT.closure)
 
 
 def episodes(batch=2, seed=1):
@@ -79,19 +67,6 @@ def test_it_acts_on_the_real_system_as_it_flies_in_simulation(forecast):
     found = controller.report()
     assert found["diverged_solves"] == 0.0 and len(controller.solves) == PLANT.n_steps
     assert 0.0 < found["solve_median"] <= found["solve_max"]
-
-
-def test_costs_on_twin_and_unseen_episodes_are_those_of_its_flights():
-    closure = LinearClosure(torch.zeros(2, 2))
-    controller, twin = control(closure=closure), DigitalTwin(PLANT, closure)
-    state, exogenous = episodes()
-    flown = controller.fly(state, exogenous, closure)
-    torch.testing.assert_close(twin.cost(controller, state, exogenous), control_cost(PLANT, flown).mean())
-    replayed = Rollout(PLANT, closure)(state, exogenous, flown.actions)
-    torch.testing.assert_close(replayed.states, flown.states, rtol=1e-9, atol=1e-9)
-    unseen = UnseenEpisodes(PLANT, 2)
-    real = controller.fly(unseen.initial_state, unseen.exogenous, PLANT.closure)
-    torch.testing.assert_close(unseen.control_costs(controller), control_cost(PLANT, real))
 
 
 class Undisturbed(LinearQuadratic):
@@ -175,18 +150,6 @@ def test_a_model_that_diverges_leaves_a_command_that_does_not():
         controller.plan(0.0, torch.full((1, 2), math.inf).double(), torch.zeros(1, 1).double())
 
 
-def test_what_cannot_be_is_refused():
-    controller = control()
-    with pytest.raises(ValueError, match="no function of the observation.*--role model_free"):
-        controller(torch.zeros(1, 2).double())
-    actor = LivePolicy(PLANT, controller, ExplorationConfig(), generator=seeded())
-    with pytest.raises(ValueError, match="PredictiveControl acts from state and exogenous input; give both"):
-        actor(torch.zeros(1, 2).double())
-    elsewhere = LinearClosure(torch.zeros(2, 2)).to("meta")
-    with pytest.raises(ValueError, match="closure is on meta"):
-        control(closure=elsewhere)
-
-
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 
 
@@ -260,22 +223,6 @@ def test_plans_are_those_of_a_quadratic_program():
         np.testing.assert_allclose(found[episode, :, 0].numpy(), wanted, atol=2e-4)
         bounded += (np.abs(wanted) > 2.0 - 1e-9).sum()
     assert bounded > 0
-
-
-def test_a_long_horizon_is_the_linear_quadratic_regulator():
-    plant = LinearQuadratic(horizon=3.0, noise=0.0)
-    A, B, _, Q, R = matrices(plant)
-    P = solve_discrete_are(A, B, Q, R)
-    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    config = PredictiveConfig(horizon=8.0, tolerance=0.0, iterations=500)
-    controller = RecedingHorizon(plant, plant.closure, config)
-    state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
-    flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
-    s = state.numpy().T
-    for k in range(plant.n_steps):
-        np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
-        s = A @ s - B @ K @ s
-    assert len(controller.solves) == 2 * plant.n_steps
 
 
 @pytest.mark.parametrize("name", ["held", "decaying"])

@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import RECIPES, recipe
 
@@ -15,8 +15,6 @@ from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
-from rt_torchrl.steps.plan import make_planner
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
@@ -113,18 +111,6 @@ def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path, monkeypatch)
             export.main(export.Config(run=tmp_path, what=(what,), formats=("c",)))
     export.main(export.Config(run=tmp_path, role="model_free", formats=("pt2",)))
     assert (tmp_path / "exported" / "linear_quadratic_model_free.pt2").is_file()
-
-
-def test_methods_and_policies_that_do_not_go_together_are_refused():
-    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
-    twin = DigitalTwin(plant, LinearClosure(torch.zeros(2, 2)))
-    policy, controller = plant.make_policy(generator), PredictiveControl(plant, twin.closure, PLANNER.receding_horizon)
-    for given, config in ((policy, PLANNER), (controller, PlannerConfig())):
-        with pytest.raises(ValueError, match="does not go with a policy of class"):
-            make_planner(twin, given, config)
-    other = PredictiveControl(plant, plant.closure, PLANNER.receding_horizon)
-    with pytest.raises(ValueError, match="another closure than the twin's"):
-        make_planner(twin, other, PLANNER)
 
 
 ALWAYS = (

@@ -3,7 +3,6 @@
 import copy
 import io
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +19,6 @@ from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)
 SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}
 
@@ -113,15 +111,6 @@ def test_a_learner_of_another_policy_is_refused():
         algorithm(learner=lambda policy: LEARNERS["ddpg"](other))
     with pytest.raises(ValueError, match="WholeEpisodes trains another policy than model_based"):
         algorithm(planner=lambda twin, policy: PLANNERS["whole episodes"](twin, other))
-
-
-def test_configuration_names_the_parts():
-    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="expected_cost")}
-    found = twinning(PLANT, **parts)
-    kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
-    assert kinds == ["ActorCritic", "WholeEpisodes", "ExpectedCost"]
-    report = found.episode()
-    assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
 
 
 def test_the_state_of_another_training_is_refused_by_the_name_of_what_does_not_fit():

@@ -1,7 +1,6 @@
 """Real systems behind foreign interfaces and simulators that call, and what only a simulation can do."""
 
 import contextlib
-import dataclasses
 import threading
 from unittest.mock import Mock
 
@@ -130,60 +129,6 @@ def run_on(env, folder, *, figures=False, **options):
     own = {"unseen": 3, "figures": figures, "twinning": SMALL}
     config = RunConfig(log_dir=folder, **own, **options)
     return Run(config, LinearQuadratic(horizon=2.0), env=env)
-
-
-def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
-    def run(folder, episodes, **options):
-        plant = LinearQuadratic(horizon=2.0)
-        return run_on(connected(plant, closure=plant.closure), folder, episodes=episodes, **options).train()
-
-    whole = run(tmp_path / "whole", 3)
-    run(tmp_path / "parts", 2)
-    parts = run(tmp_path / "parts", 3, resume=True)
-    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
-        assert {**one, "seconds": None} == {**other, "seconds": None}
-    assert "true" in whole["summary"]["closure"]
-
-
-def test_the_twin_of_it_finds_the_truth(tmp_path):
-    """The rig is the oracle plant, whose four coefficients one record without noise shows to rounding."""
-    assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
-    config = RunConfig(
-        log_dir=tmp_path,
-        unseen=2,
-        episodes=1,
-        figures=False,
-        twinning=dataclasses.replace(SMALL, assimilation=assimilation),
-    )
-    plant = LinearQuadratic(horizon=4.0)
-    found = Run(config, plant, env=connected(plant)).train()["summary"]["closure"]["found"]["matrix"]
-    torch.testing.assert_close(torch.tensor(found), torch.tensor(plant.true_closure), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"state": Reading(keys=("position",))},
-            r"state is read from \['position'\], .*does not report; it has .*encoder",
-        ),
-        ({"state": WIND}, r"state, read from .*has shape \(1,\); the plant needs \(2,\), which is \['position'"),
-        ({"exogenous": None}, r"exogenous=\(\) must be a Reading, or a constant for each input of \['disturbance'\]"),
-        ({"exogenous": Reading(keys=("gust",))}, r"exogenous is read from \['gust'\]"),
-        ({"applied": Reading(keys=("current",))}, r"applied is read from \['current'\]"),
-        ({"actuation": Actuation(key="amperes")}, "key='amperes' of the actuation is no action"),
-        (
-            {"actuation": Actuation(key="volts", scale=0.25, offset=-0.5)},
-            r"\[-2, 2\] N, the environment's over \[-1.25, ",
-        ),
-        ({"actuation": Actuation(key="volts", scale=-0.5, offset=-0.5)}, r"the environment's over \[-3, 1\]"),
-    ],
-)
-def test_what_does_not_fit_is_refused_before_anything_moves(options, message):
-    rig = Rig(LinearQuadratic())
-    rig._reset = rig._step = None
-    with pytest.raises(ValueError, match=message):
-        connected(LinearQuadratic(), rig=rig, **options)
 
 
 def test_a_tuple_of_gymnasium_is_refused_until_it_is_flattened():
@@ -385,5 +330,3 @@ def test_a_report_that_is_not_as_declared_is_refused(reported):
     with pytest.raises(ValueError, match="place and rate=.* must be 2 numbers"):
         env.reset()
     env.close()
-    with pytest.raises(ValueError, match="must not be empty"):
-        CallingSimulator(oscillator, {}, PLANT.actions)

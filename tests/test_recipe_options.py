@@ -21,27 +21,6 @@ from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 
 
-def made(plant, **options):
-    """The recipe's plant under these options."""
-    return config_class_of(RECIPES / f"{plant}.py")(**options).plant()
-
-
-@pytest.mark.parametrize(
-    ("plant", "options", "message"),
-    [
-        ("wind_turbine", {"wind_files": (Path("gone.bts"),)}, "wind_files: gone.bts is no file"),
-        ("wind_turbine", {"real": "ROSCO"}, "real='ROSCO' does not exist; choose simulation or rosco"),
-        ("flapping_wing", {"peak": "sharp"}, "peak='sharp' does not exist; choose unit or printed"),
-        ("pendulum", {"horizon": 1e308}, r"horizon=1e\+308 s of plant 'pendulum' is inf steps dt=0.05 s"),
-        ("wind_turbine", {"dt": 0.0}, "dt=0.0 s"),
-        ("cryogenic_tank", {"horizon": 1e15}, "horizon=.* of plant 'cryogenic_tank' is .* steps .*at most 1e"),
-    ],
-)
-def test_options_out_of_range_are_refused(plant, options, message):
-    with pytest.raises(ValueError, match=message):
-        made(plant, **options)
-
-
 def test_weights_of_another_task_are_refused():
     made = recipe("wind_turbine")
     weights = made.EngineeringCost(pitch_rate=0.1)

@@ -9,35 +9,42 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import double, seeded
 from test_classical import PD
 from test_hypotheses import Suspecting
+from test_real_system import WIND, Rig, connected
 from torch import nn
 from traced_function import sections
 
 import rt_torchrl
-from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
+from rt_torchrl import ConnectedPlant, PlannerConfig
+from rt_torchrl.contract.check import require_controller
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+from rt_torchrl.fit.log import Column, checked, read_log
+from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.settings import module_of
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import Rollout
 
 MODULES = """
-    control.command_cost control.forecasts evaluation.optimum
+    control.command_cost control.forecasts control.predictive_control evaluation.optimum
     envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
     envs.cryogenic_tank.saturation envs.cryogenic_tank.unknown envs.flapping_wing.closures
     envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real
     envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
     envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log
-    plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble systems.config systems.safety
+    plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble steps.plan systems.config
+    systems.exploration systems.safety
 """.split()
 """Modules of the library whose names expressions may use beside the public ones."""
+RECIPES = Path(__file__).parent.parent / "recipes"
 ROWS = [row for section in sections("refusals.txt").values() for row in section.values()]
 LQ = LinearQuadratic()
 LAM, BETA, FLAT = np.array([2.0, 3.0, 3.5, 5.0, 7.5, 8.0]), np.array([-2.0, 0.0, 0.5, 4.0, 9.0]), np.zeros((6, 5))
-FITTED = {"method": "levenberg_marquardt", "inputs": "record", "initial": "estimated"}
 
 
 class Stepping(LinearQuadratic):
@@ -49,10 +56,52 @@ def zeros(*shape):
     return torch.zeros(shape, dtype=torch.float64)
 
 
-def text(content):
-    path = Path(tempfile.mkdtemp(), "table.csv")
-    path.write_text(content)
+def text(content, name="table.csv"):
+    path = Path(tempfile.mkdtemp(), name)
+    path.write_text(content, encoding="utf-8")
     return path
+
+
+def recipe(name, **options):
+    """The configuration of a recipe."""
+    return module_of(RECIPES / f"{name}.py").Config(**options)
+
+
+def options_file(content):
+    """The turbine's configuration by a file."""
+    arguments = ["--config", str(text(content, "config.json"))]
+    return from_command_line(module_of(RECIPES / "wind_turbine.py").Config, arguments)
+
+
+TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,1,0,b\n250,3000,0.3,-1,0.5,c\n"
+
+
+def log(table, *columns):
+    return checked(read_log(text(table), LQ, [Column.parse(column) for column in columns]), LQ)
+
+
+def law(method=PD.law, **own):
+    """A PD law with other methods, as the first controller of a run."""
+    return require_controller("first", type("Mine", (PD,), {"law": method, **own}), LQ)
+
+
+def still(**options):
+    """A real system of which nothing may move before it fits."""
+    rig = Rig(LQ)
+    rig._reset = rig._step = None
+    return connected(LQ, rig=rig, **options)
+
+
+def client(entries=None, commands=("command.force",), **options):
+    entries = {"state": ("position", "velocity")} if entries is None else entries
+    return ConnectedPlant(None, entries, commands, LQ.actions, **{"period": 0.1} | options)
+
+
+def RECEDING(seconds):
+    return PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=seconds))
+
+
+MPC = PredictiveControl(LQ, LQ.closure, PredictiveConfig(horizon=1.0))
 
 
 def wind_record(time, speed):
@@ -92,7 +141,7 @@ class Names(dict):
 
 HERE = Names(globals())
 LAGGED = HERE["LAGGED"] = rt_torchrl.LaggedActuator(LQ, "force", 0.4)
-READ_BY_THE_TABLE = Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
+READ_BY_THE_TABLE = WIND, LinearClosure, Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.parts[0])

@@ -164,26 +164,6 @@ def test_a_file_may_hold_a_few_options(tmp_path):
     assert found.twinning.planner.realisations == default.twinning.planner.realisations == 50
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "config.json is damaged, or cannot be read"),
-        ("[1]", "must hold an object"),
-        ('{"epsodes": 3}', "has no option epsodes"),
-        ('{"episodes": 0}', "episodes=0 must be at least 1"),
-        ("[" * 100_000, "cannot be read: maximum recursion depth"),
-        ('\ufeff{"episodes": 3}', "cannot be read: .*BOM"),
-        ('{"recipe": "x"}', "its recipe is 'x'; it must be an object"),
-        ('{"recipe": {"file": "/a/flapping_wing.py"}}', "is of the recipe flapping_wing.py, not of wind_turbine.py"),
-    ],
-)
-def test_a_file_that_cannot_be_carried_out_is_refused(content, message, tmp_path):
-    file = tmp_path / "config.json"
-    file.write_text(content, encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
-        from_command_line(TURBINE, ["--config", str(file)])
-
-
 def many_weights(metrics, count):
     """Results as those of a plant with a classical controller, five merits and a closure of many weights."""
     merit = {f"quantity {k}": {"mean": 1.0, "median": 1.0} for k in range(5)}

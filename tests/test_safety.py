@@ -216,14 +216,9 @@ def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_o
 
 
 def test_what_cannot_be_guarded_is_refused():
-    for interval in (0.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=f"interval={interval}"):
-            SafetyConfig(interval=interval)
     unlimited = Unbounded(shape=(1,), dtype=torch.float64)
     with pytest.raises(ValueError, match="low=.inf"):
         ActionLimits(unlimited, SafetyConfig(interval=DT, low=(float("inf"),)))
-    with pytest.raises(ValueError, match="begins with a fault"):
-        layer(ranges={"observation": (100.0, 101.0)}).reset()
     with pytest.raises(ValueError, match="fallback gave"):
         fly(failing(broken=[1], fallback=lambda found: torch.full((1, 1), torch.nan)), [0.0] * 20)
     pytest.importorskip("gymnasium")

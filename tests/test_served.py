@@ -134,23 +134,6 @@ def test_a_plant_that_never_answers_is_said_in_a_sentence():
         connected(line, patience=2.0).reset()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"period": 0.0}, "period=0.0 s"),
-        ({"patience": 0.0}, "patience=0.0 s"),
-        ({"answered": "answered"}, "answered='answered' takes the number of a sample"),
-        ({"commands": ()}, "must be one tag for each of the actions"),
-        ({"entries": {}}, "entries=.* must not be empty"),
-    ],
-)
-def test_a_client_that_cannot_work_is_refused(options, message):
-    given = {"entries": ENTRIES, "commands": COMMANDS, "period": 0.1, **options}
-    entries, commands = given.pop("entries"), given.pop("commands")
-    with pytest.raises(ValueError, match=message):
-        ConnectedPlant(Line(Time(), 0.1), entries, commands, PLANT.actions, **given)
-
-
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
     """States, inputs and applied actions as they came over the line are a step of the plant, to the last digit."""
@@ -171,22 +154,6 @@ def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
     whole = ~flown["next", "refused"].flatten() & (env.skipped == 0 and env.stale == 0)
     assert whole.sum() >= 6 or env.skipped or env.stale  # a busy machine may miss a sample
     torch.testing.assert_close(ends[whole], flown["next", "state"][whole], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("registers", "message"),
-    [
-        ({"read": {}}, "read={} must name registers"),
-        ({"read": {"a": Register(0), "b": Register(200)}}, "read spans 204 registers from 0 on"),
-        ({"written": {"a": Register(0), "b": Register(8)}}, "one behind the other"),
-        ({"written": {"a": Register(0, table="input")}}, "holding registers"),
-        ({"read": {"a": Register(0), "b": Register(4, table="input")}}, "tables holding and input, and one request"),
-    ],
-)
-def test_registers_that_no_request_takes_are_refused(registers, message):
-    given = {"read": {"a": Register(0)}, "written": {"b": Register(4)}, **registers}
-    with pytest.raises(ValueError, match=message):
-        ModbusLink(None, **given)
 
 
 @pytest.mark.parametrize(
@@ -291,11 +258,6 @@ def test_a_served_turbine_is_trained_on_while_it_operates(tmp_path):
     versions = [record["version"] for record in metrics["episodes"]]
     assert len(versions) == 3 and versions == sorted(versions) and versions[-1] >= 1.0
     assert all(0.0 < record["late_median"] < 100.0 for record in metrics["episodes"])
-
-
-def test_another_real_system_than_the_served_one_is_refused():
-    with pytest.raises(ValueError, match="real, unknown and model_error are other real systems"):
-        served_turbine.Config(unknown=("pitch",))
 
 
 # What the page "Connect your machine" prints: its example makes a real system that has not connected yet.

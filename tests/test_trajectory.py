@@ -26,7 +26,7 @@ from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin, constant
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)
@@ -176,17 +176,6 @@ def twin_and_policy():
         plant.make_policy(generator),
         (plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)),
     )
-
-
-def test_a_constant_module_follows_the_one_it_was_made_from():
-    original = nn.Sequential(nn.Linear(2, 3), nn.BatchNorm1d(3)).double()
-    shared, x = constant(original), torch.randn(5, 2, dtype=torch.float64)
-    assert not any(w.requires_grad for w in shared.parameters()) and all(w.requires_grad for w in original.parameters())
-    # As Levenberg-Marquardt, Adam and a checkpoint move weights: in place. The buffers move with a forward pass.
-    original.load_state_dict({key: 2 * value for key, value in original.state_dict().items()})
-    original(x)
-    shared.eval(), original.eval()
-    assert torch.equal(shared(x), original(x))
 
 
 def test_planning_holds_the_closure_constant_and_changes_no_gradient_of_the_policy():
@@ -349,26 +338,6 @@ def test_a_replay_begins_anew_in_each_segment_and_is_no_number_where_it_diverges
     lost = twin.replayed(wild, segment)
     first = (n - 1) // segment * segment if segment else 0
     assert lost[first + 1 :].isnan().all() and torch.equal(lost[: first + 1], found[: first + 1])
-
-
-def test_matrix_is_the_hessian_where_the_residual_vanishes():
-    """At the true weights the Gauss-Newton matrix is the Hessian of J_p, here by differences of exact gradients."""
-    plant = LinearQuadratic(horizon=2.0)
-    twin, flown, exogenous = recorded(plant)
-    twin.closure.load_state_dict(plant.closure.state_dict())
-    assimilation, weight = Assimilation(twin, AssimilationConfig()), twin.closure.matrix
-    found = assimilation.likelihood(flown).normal_equations()
-    columns, step = [], 1e-5
-    for k in range(weight.numel()):
-        gradients = []
-        for sign in (1.0, -1.0):
-            with torch.no_grad():
-                weight.view(-1)[k] += sign * step
-                gradients.append(assimilation.likelihood(flown).normal_equations().gradient)
-                weight.view(-1)[k] -= sign * step
-        columns.append((gradients[0] - gradients[1]) / (2.0 * step))
-    # step² of the central difference and the rounding 1e-16/1e-5, both about 1e-10 of the matrix.
-    torch.testing.assert_close(found.matrix, torch.stack(columns, -1), rtol=1e-7, atol=1e-8)
 
 
 class Residuals(nn.Module):

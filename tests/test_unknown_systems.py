@@ -113,22 +113,6 @@ def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixe
     torch.testing.assert_close(first, torch.full_like(first, 2.0), rtol=5e-3, atol=0.0)
 
 
-@pytest.mark.parametrize(
-    ("plant", "options", "message"),
-    [
-        ("wind_turbine", {"unknown": ("gust",)}, "gust does not exist"),
-        ("wind_turbine", {"unknown": ("pitch",), "model_error": True}, "does not go with model_error"),
-        ("wind_turbine", {"unknown": ("pitch",), "real": "rosco"}, "does not go with real='rosco'"),
-        ("flapping_wing", {"unknown": ("sag",), "model_error": True}, "does not go with model_error"),
-        ("cryogenic_tank", {"unknown": ("bias_5",), "model_error": True}, "does not go with model_error"),
-        ("flapping_wing", {"task": "leap"}, "task='leap' does not exist; choose paper or hop"),
-    ],
-)
-def test_options_that_do_not_go_with_an_unknown_system_are_refused(plant, options, message):
-    with pytest.raises(ValueError, match=message):
-        config_class_of(RECIPES / f"{plant}.py")(**options)
-
-
 def test_several_systems_combine_in_the_order_of_their_parts():
     config = config_class_of(RECIPES / "wind_turbine.py")(unknown=("pitch", "inflow"), policy="scheduled")
     hidden = [state.name for state in config.plant().states if state not in config.plant().readings]

@@ -29,10 +29,9 @@ from rt_torchrl import (
     shipped_plants,
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
-from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector, collector_of
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
@@ -84,17 +83,6 @@ def test_a_run_judges_on_the_true_system_and_keeps_its_hidden_states_hidden(tmp_
     export_c(loaded.policy("model_free"), tmp_path / "policy.c", loaded.physics, function="policy")
 
 
-def test_the_optimum_is_that_of_the_true_system():
-    unseen = UnseenEpisodes(real(), 4)
-    start = LinearGain([[0.1, 0.1]])
-    found = exact_optimum(unseen, lambda _: LinearGain([[0.1, 0.1]]), starts=1, iterations=20, polish=10)
-    nominal = UnseenEpisodes(BASE, 4)
-    other = exact_optimum(nominal, lambda _: LinearGain([[0.1, 0.1]]), starts=1, iterations=20, polish=10)
-    cost = control_cost(real(), Rollout(real(), real().closure, found.policy)(unseen.initial_state, unseen.exogenous))
-    assert found.cost == pytest.approx(cost.mean().item(), rel=1e-9)
-    assert found.cost < 0.9 * min(unseen.control_costs(policy).mean() for policy in (other.policy, start))
-
-
 def test_a_twin_is_judged_by_what_sensors_read():
     unseen = UnseenEpisodes(real(), 3)
     flown = unseen.fly(LinearGain([[0.3, 0.3]]))
@@ -129,18 +117,6 @@ def test_state_feedback_acts_on_readings(kind):
         command = controller.act(k * plant.dt, s[:, :2], exogenous[:, k])
         s = plant.step(torch.tensor(k * plant.dt).double(), s, command, exogenous[:, k], plant.closure).state
     torch.testing.assert_close(flown.states[:, -1], s, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("controller", [LinearGain([[0.3, 0.3]]), PD(BASE)], ids=["policy", "PD"])
-def test_machine_code_flies_as_steps_do(controller):
-    found = []
-    for kind in (collector_of, EpisodeCollector):
-        env = PlantEnv(real(), seed=3, noise=0.01)
-        actor = LivePolicy(BASE, controller, ExplorationConfig(), generator=seeded())
-        actor.begin(controller, strength=0.5)
-        found.append(kind(env, actor, BASE).rollout())
-    for key in ("state", "observation", "action", ("next", "reward")):
-        torch.testing.assert_close(found[0][key], found[1][key], rtol=1e-9, atol=1e-9)
 
 
 def test_a_safety_layer_sees_readings_alone(tmp_path):
