@@ -1,11 +1,11 @@
 """Time an episode's cost and its gradient by each engine; all take turns in one process."""
 
 import itertools
+import math
 import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -16,6 +16,7 @@ if __name__ == "__main__":
 
 import torch
 from torch import Tensor, nn
+from torch.utils.benchmark import Timer
 
 from rt_torchrl import Engine, Plant, Rollout, SaturatedMLP, Scenario, configuration, main_of, shipped_plants
 from rt_torchrl.atomic_file import make_folder, write_json
@@ -26,8 +27,7 @@ PlantName = Literal["flapping_wing", "wind_turbine", "cryogenic_tank"]
 Policy = Literal["affine", "mlp"]
 QUANTITIES = ("forward", "gradient")
 TURN = 0.1
-"""Time [s] that the calls of a turn take together. A single call of a millisecond would measure what the engine before
-it left in the caches."""
+"""Least time [s] that the calls of a turn take together."""
 STEPS_OF: dict[PlantName, float] = {"cryogenic_tank": 4.32}
 """Control intervals that differ from the plants' own [s]: with 30 s the tank would run empty within 1e5 intervals."""
 HIDDEN = (32, 32)
@@ -48,7 +48,6 @@ class Config:
             change least; on more threads they are wall times.
         repeats: number of turns behind a median, each of calls for a tenth of a second, at least one.
         limit: time of one call [s], predicted by smaller sizes, above which an engine is left out.
-        quick: whether to time two small sizes once.
         output: folder for benchmark.json and a figure of each plant; by default nothing is written.
     """
 
@@ -60,7 +59,6 @@ class Config:
     threads: AtLeastOne = 1
     repeats: AtLeastOne = 5
     limit: Positive = 2.0
-    quick: bool = False
     output: File | None = None
 
     def __post_init__(self) -> None:
@@ -68,10 +66,6 @@ class Config:
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name}={values} must be one value or several different ones.")
-
-    def effective(self) -> "Config":
-        """The options that are carried out, in which ``quick`` has replaced other options."""
-        return replace(self, horizons=(20, 60), realisations=(2,), repeats=1, quick=False) if self.quick else self
 
 
 class System(NamedTuple):
@@ -93,18 +87,10 @@ Contender = Callable[[Scenario], Calls]
 
 
 class Row(NamedTuple):
-    """The times of one contender at one size.
+    """The median times [s] of one contender at one size.
 
-    Args:
-        plant: name of the plant.
-        steps: number of control intervals.
-        realisations: number of trajectories.
-        contender: name of the engine.
-        forward: median time of the cost [s].
-        gradient: median time of its gradient [s].
-        ratio: time of the gradient over that of the first contender.
-        first: wall time of the first gradient of this size [s], which may compile.
-        gap: relative difference of the gradient from that of the first contender.
+    ``ratio`` is that of the gradient over the first contender's, ``first`` the wall time of the first gradient of this
+    size, which may compile, and ``gap`` the relative difference of the gradient from that of the first contender.
     """
 
     plant: str
@@ -118,11 +104,11 @@ class Row(NamedTuple):
     gap: float
 
 
-def plant_of(name: PlantName, steps: int | None = None) -> Plant:
-    """A plant, with episodes of this many control intervals or of its own number."""
+def plant_of(name: PlantName, steps: int = 100) -> Plant:
+    """A plant, with episodes of this many control intervals."""
     kind = shipped_plants()[name]
-    options: dict[str, float] = {"dt": STEPS_OF[name]} if name in STEPS_OF else {}
-    return kind(**options) if steps is None else kind(**options, horizon=steps * kind(**options).dt)
+    dt = STEPS_OF.get(name) or kind().dt
+    return kind(dt=dt, horizon=steps * dt)
 
 
 def system_of(name: PlantName, policy: Policy) -> System:
@@ -154,15 +140,12 @@ def engine_of(engine: Engine, system: System) -> Contender:
 
 
 def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[System], Contender]]) -> list[Row]:
-    """The times of all contenders on one plant, the smaller sizes first."""
+    """The times of all contenders on one plant, the smaller sizes first; each is printed at once."""
     system, rows = system_of(name, config.policy), list[Row]()
-    contenders = {
-        engine: engine_of(engine, system) for engine in config.engines if refusal(engine, system.plant) is None
-    }
+    engines = [engine for engine in config.engines if refusal(engine, system.plant) is None]
+    contenders = {engine: engine_of(engine, system) for engine in engines}
     contenders |= {peer: make(system) for peer, make in peers.items()}
-    for steps, batch in sorted(
-        itertools.product(config.horizons, config.realisations), key=lambda pair: pair[0] * pair[1]
-    ):
+    for steps, batch in sorted(itertools.product(config.horizons, config.realisations), key=math.prod):
         plant, generator = plant_of(name, steps), torch.Generator().manual_seed(1)
         scenario = Scenario(plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator))
         calls = {
@@ -170,7 +153,6 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
             for contender, made in contenders.items()
             if predicted(rows, contender, steps, batch) <= config.limit
         }
-        _tell(f"{name}, {steps} intervals, {batch} realisations: {', '.join(calls)}")
         gradients, first = dict[str, Tensor](), dict[str, float]()
         for contender, call in calls.items():
             start = time.perf_counter()
@@ -179,62 +161,38 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
         forward, gradient = (
             medians({who: getattr(call, quantity) for who, call in calls.items()}, config) for quantity in QUANTITIES
         )
-        best = next(iter(calls), "")
-        rows += [
-            Row(
-                name,
-                steps,
-                batch,
-                who,
-                forward[who],
-                gradient[who],
-                gradient[who] / gradient[best],
-                first[who],
-                ((gradients[who] - gradients[best]).norm() / gradients[best].norm()).item(),
-            )
-            for who in calls
-        ]
+        for who in calls:
+            best = next(iter(calls))
+            ratio = gradient[who] / gradient[best]
+            gap = ((gradients[who] - gradients[best]).norm() / gradients[best].norm()).item()
+            rows.append(Row(name, steps, batch, who, forward[who], gradient[who], ratio, first[who], gap))
+            print(line(rows[-1]), flush=True)
     return rows
 
 
 def predicted(rows: Sequence[Row], contender: str, steps: int, realisations: int) -> float:
     """Time of a gradient [s] that smaller sizes predict, in proportion to the steps and to more realisations."""
-    return min(
-        (
-            row.gradient * steps / row.steps * max(1.0, realisations / row.realisations)
-            for row in rows
-            if row.contender == contender
-        ),
-        default=0.0,
-    )
+    known = [row for row in rows if row.contender == contender]
+    times = [r.gradient * steps / r.steps * max(1.0, realisations / r.realisations) for r in known]
+    return min(times, default=0.0)
 
 
 def medians(functions: Mapping[str, Callable[[], Any]], config: Config) -> dict[str, float]:
     """Median time of one call of each function [s]; in each turn every function has its calls, one after another."""
     clock = time.process_time if config.threads == 1 else time.perf_counter
-    seconds, counts = {name: list[float]() for name in functions}, dict[str, int]()
+    seconds = {name: list[float]() for name in functions}
     for _ in range(config.repeats):
         for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            count = counts.setdefault(name, max(1, round(TURN / (time.perf_counter() - start))))
-            start = clock()
-            for _ in range(count):
-                function()
-            seconds[name].append((clock() - start) / count)
+            timer = Timer("function()", globals={"function": function}, timer=clock, num_threads=config.threads)
+            seconds[name].append(timer.blocked_autorange(min_run_time=TURN).median)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def table(rows: Sequence[Row], config: Config) -> str:
-    """The times as text; a size and engine that are not in it would have taken longer than the limit."""
-    clock = "CPU" if config.threads == 1 else "wall"
-    head = f"{'plant':<15}{'intervals':>9}{'N_z':>6}  {'engine':<15}{clock + ' ms':>11}{'gradient':>10}"
-    lines = [f"{head}{'ratio':>9}{'first s':>9}{'gap':>9}"]
-    for row in rows:
-        size = f"{row.plant:<15}{row.steps:>9}{row.realisations:>6}  {row.contender:<15}"
-        times = f"{1e3 * row.forward:>11.3f}{1e3 * row.gradient:>10.3f}{row.ratio:>9.1f}{row.first:>9.2f}"
-        lines.append(f"{size}{times}{row.gap:>9.1e}")
-    return "\n".join(lines)
+def line(row: Row) -> str:
+    """A line of the table."""
+    size = f"{row.plant:<15}{row.steps:>9}{row.realisations:>6}  {row.contender:<15}"
+    times = f"{1e3 * row.forward:>11.3f}{1e3 * row.gradient:>10.3f}{row.ratio:>9.1f}{row.first:>9.2f}"
+    return f"{size}{times}{row.gap:>9.1e}"
 
 
 def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
@@ -243,47 +201,39 @@ def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
 
     content = {"command": sys.argv, "threads": config.threads, "rows": [row._asdict() for row in rows]}
     write_json(folder / "benchmark.json", content)
-    clock, batch = "CPU" if config.threads == 1 else "wall", config.realisations[0]
+    batch = config.realisations[0]
     for plant in config.plants:
-        title = f"{plant}, {config.policy} policy, threads: {config.threads}\n{clock} time [s]"
+        title = f"{plant}, {config.policy} policy, threads: {config.threads}"
         figure, axes = panels(1, 2, title=title, size=(10.5, 4.0), sharey="row")
         for ax, quantity in zip(axes[0], QUANTITIES, strict=True):
             drawn = [row for row in rows if (row.plant, row.realisations) == (plant, batch)]
             for k, who in enumerate(dict.fromkeys(row.contender for row in drawn)):
                 x, y = zip(*((r.steps, getattr(r, quantity)) for r in drawn if r.contender == who), strict=True)
-                look = {"color": COLOURS.get(who, f"C{k}"), "marker": "osv^D*P"[k % 7], "markersize": 5}
-                ax.plot(x, y, label=who.replace("_", " "), **look)
+                ax.plot(x, y, "osv^D*P"[k % 7] + "-", color=COLOURS.get(who, f"C{k}"), label=who.replace("_", " "))
             ax.set(xscale="log", yscale="log", xlabel="control intervals")
-            caption(ax, quantity, f"{batch} realisations")
+            caption(ax, f"{quantity} [s]", f"{batch} realisations")
         legend_below(figure, list(axes.flat))
         figure.savefig(folder / f"{plant}.png")
 
 
-def _tell(doing: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\033[K{doing}", end="", file=sys.stderr, flush=True)
+def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | None = None) -> None:
+    """Time the engines, and others beside them, and print the times.
 
-
-def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | None = None) -> list[Row]:
-    """Time the engines, and others beside them.
+    A size and engine that are not in the table would have taken longer than the limit.
 
     Args:
         config: the options.
         peers: others that compute the same, by name; each is a function of the system that gives a contender.
-
-    Returns:
-        The rows of the table that is printed.
     """
-    config = config.effective()
     if config.output is not None:
         make_folder("output", config.output)
     torch.set_num_threads(config.threads)
+    clock = "CPU" if config.threads == 1 else "wall"
+    head = f"{'plant':<15}{'intervals':>9}{'N_z':>6}  {'engine':<15}{clock + ' ms':>11}{'gradient':>10}"
+    print(f"{head}{'ratio':>9}{'first s':>9}{'gap':>9}", flush=True)
     rows = [row for name in config.plants for row in rows_of(config, name, peers or {})]
-    _tell("")
-    print(table(rows, config))
     if config.output is not None:
         save(rows, config, config.output)
-    return rows
 
 
 if __name__ == "__main__":

@@ -195,26 +195,17 @@ class Config(RunConfig):
 
         return fouled
 
+    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+        from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib
 
-def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
-    from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib
-
-    return figures.figures_of(snapshot)
+        return figures.figures_of(snapshot)
 
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    Run(
-        config,
-        config.plant(),
-        believed=config.believed(),
-        plant_figures=plant_figures,
-        baselines=VALVES,
-        first=PIValve,
-        **parts,
-    ).train()
+    Run(config, config.plant(), baselines=VALVES, first=PIValve, **parts).train()
 
 
 if __name__ == "__main__":

@@ -28,11 +28,16 @@ from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
 
-FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c", "discon"), "twin": ("c",)}
-"""The formats that there are of each thing."""
+FORMATS: dict[str, dict[str, Callable[..., float | None]]] = {
+    "policy": {"c": export_c, "onnx": export_onnx, "pt2": export_program},
+    "controller": {"c": export_controller, "discon": export_discon},
+    "twin": {"c": export_twin},
+}
+"""What writes each thing in each format."""
 KINDS = tuple(dict.fromkeys(kind for kinds in FORMATS.values() for kind in kinds))
 DEFAULT = ("c", "pt2")
-WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
+SIZES = {"policy": "actions' ranges", "controller": "actions' ranges", "twin": "sizes of the states"}
+"""What differences are shares of."""
 
 
 @configuration
@@ -106,31 +111,17 @@ def main(config: Config) -> None:
 
 def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) -> str:
     """Write one file, and say how it agrees."""
-    role, plant = config.name or f"{run.plant.name}_{config.role}", run.physics
-    name = {"policy": role, "controller": f"{role}_controller", "twin": f"{config.name or plant.name}_twin"}[what]
-    path = output / f"{name}.{kind}"
-    if what == "policy":
-        named = {"function": name} if kind == "c" else {}
-        error = WRITERS[kind](run.policy(config.role), path, plant, **named)
-        found = "" if error is None else f"within {error:.1e} of the actions' ranges"
-    elif what == "controller":
-        path, writer = (output / f"{role}_discon.c", export_discon) if kind == "discon" else (path, export_controller)
-        flown = writer(run.policy(config.role), path, plant, name=name)
-        found = (
-            ""
-            if flown is None
-            else (
-                f"within {flown.difference:.1e} of the actions' ranges over {flown.intervals} intervals; "
-                f"{flown.from_plant:.1e} from the policy on the plant's own states"
-            )
-        )
-    else:
-        believed, beside = run.twin.believed, run.twin.hypothesis
-        error = export_twin(believed.closure, path, believed.plant, name=name)
-        found = "" if error is None else f"within {error:.1e} of the sizes of the states"
-        if beside is not None:
-            found = f"{found or 'not checked'}; the twin with {beside}, which explains the records best"
-    return f"{path}: {found or 'not checked'}"
+    plant, beside = run.physics, None
+    part, file = run.policy(config.role), config.name or f"{run.plant.name}_{config.role}"
+    name = f"{file}_controller" if what == "controller" else file
+    if what == "twin":
+        part, plant, beside = run.twin.believed.closure, run.twin.believed.plant, run.twin.hypothesis
+        name = f"{config.name or run.physics.name}_twin"
+    path = output / (f"{file}_discon.c" if kind == "discon" else f"{name}.{kind}")
+    named = {"function" if what == "policy" else "name": name} if kind in ("c", "discon") else {}
+    error = FORMATS[what][kind](part, path, plant, **named)
+    found = "not checked" if error is None else f"within {error:.1e} of the {SIZES[what]}"
+    return f"{path}: {found}" + (f"; the twin with {beside}, which explains the records best" if beside else "")
 
 
 if __name__ == "__main__":

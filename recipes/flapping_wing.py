@@ -174,26 +174,17 @@ class Config(RunConfig):
             return self.drone(MASS)
         return self.drone(BELIEVED) if self.model_error else None
 
+    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+        from rt_torchrl.envs.flapping_wing import figures  # here, because an episode need not wait for Matplotlib
 
-def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
-    from rt_torchrl.envs.flapping_wing import figures  # here, because an episode need not wait for Matplotlib
-
-    return figures.figures_of(snapshot)
+        return figures.figures_of(snapshot)
 
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    Run(
-        config,
-        config.plant(),
-        believed=config.believed(),
-        plant_figures=plant_figures,
-        baselines={"PD": TrimmedPD},
-        first=TrimmedPD,
-        **parts,
-    ).train()
+    Run(config, config.plant(), baselines={"PD": TrimmedPD}, first=TrimmedPD, **parts).train()
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ if __name__ == "__main__":
 import torch
 from pydantic import Field
 from wind_turbine import Config as Turbine
-from wind_turbine import plant_figures
 
 from rt_torchrl import OperationConfig, Plant, SafetyConfig, configuration, main_of
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
@@ -192,7 +191,7 @@ def main(config: Config, **parts: Any) -> None:
 
     config = dataclasses.replace(config, asynchronous=True, operation=OperationConfig(continuous=True))
     env = partial(machine, plant, SAFE, *place)
-    Run(config, plant, env=env, plant_figures=plant_figures, first=JonkmanController, **parts).train()
+    Run(config, plant, env=env, first=JonkmanController, **parts).train()
 
 
 if __name__ == "__main__":

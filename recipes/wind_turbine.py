@@ -166,11 +166,10 @@ class Config(RunConfig):
         worn, middle = PowerCoefficientTable.nrel5mw(worn=True), self.effective().episodes // 2
         return lambda episode: plant.closure if episode < middle else worn
 
+    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+        from rt_torchrl.envs.wind_turbine import figures  # here, because an episode need not wait for Matplotlib
 
-def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
-    from rt_torchrl.envs.wind_turbine import figures  # here, because an episode need not wait for Matplotlib
-
-    return figures.figures_of(snapshot)
+        return figures.figures_of(snapshot)
 
 
 def main(config: Config, **parts: Any) -> None:
@@ -183,9 +182,7 @@ def main(config: Config, **parts: Any) -> None:
         env = partial(rosco_turbine, plant, seed=config.seed, device=require_device(config.device))
         config = dataclasses.replace(config, real_unseen=config.real_unseen or config.unseen)  # a simulator may fly
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
-    believed = config.believed()
-    parts = {"plant_figures": plant_figures, **system, **parts}
-    Run(config, plant, believed=believed, first=JonkmanController, **parts).train()
+    Run(config, plant, first=JonkmanController, **{**system, **parts}).train()
 
 
 if __name__ == "__main__":

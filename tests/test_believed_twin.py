@@ -45,7 +45,7 @@ def run(tmp_path_factory):
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
     options = {"unseen": 3, "figures": False}
     config = Config(episodes=1, log_dir=folder, twinning=twinning, **options)
-    Run(config, config.plant(), believed=config.believed()).train()
+    Run(config, config.plant()).train()
     return load_run(folder, Config)
 
 

@@ -78,7 +78,7 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     policy = law(plant)
     n_memory = len(plant.states) - 1
     agreement = export_controller(policy, tmp_path / "turbine.c", plant, name="turbine")
-    assert agreement.difference < CLOSE and agreement.intervals == 50
+    assert agreement < CLOSE
     start, exogenous = plant.draw_initial_state(1, seeded(1)), plant.draw_exogenous(1, seeded(2))
     in_c = InC(tmp_path / "turbine.c", 2, n_memory, 2)
     in_c.start(start[0, 0].item(), exogenous[0, 0, 0].item())
@@ -159,17 +159,6 @@ def test_filters_clock_and_order_of_the_states(tmp_path):
         # One Runge-Kutta step of 0.1 time constants errs by 0.1⁵/120 of what the filter has to go.
         assert in_c.step(x, v)[0] == pytest.approx(expected, abs=2e-6)
     assert in_c.state.steps == 50
-
-
-@needs_compiler
-def test_the_error_of_the_filters_is_of_second_order(tmp_path):
-    found = [
-        export_controller(LinearGain(GAINS), tmp_path / "lag.c", Lagged(dt=dt, horizon=5.0)).from_plant
-        for dt in (0.1, 0.05, 0.025)
-    ]
-    assert found[0] > 1e-7
-    for coarse, fine in zip(found, found[1:], strict=False):
-        assert coarse / fine == pytest.approx(4.0, rel=0.5)
 
 
 @needs_compiler

@@ -95,7 +95,11 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     class Heavier(LinearQuadratic):
         B = ((0.0,), (0.75,))
 
-    run = small_run(tmp_path, 1, Heavier(horizon=2.0), parts={"believed": LinearQuadratic(horizon=2.0)})
+    class Config(RunConfig):
+        def believed(self):
+            return LinearQuadratic(horizon=2.0)
+
+    run = small_run(tmp_path, 1, Heavier(horizon=2.0), config=Config)
     found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
     assert isinstance(run.unseen.plant, Heavier)

@@ -105,7 +105,12 @@ def believing(tmp_path_factory):
     config = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
     options = {"episodes": 1, "unseen": 2, "figures": False, "twinning": twinning}
-    Run(RunConfig(log_dir=folder, **options), LaggedActuator(known, "force", LAG), believed=known).train()
+
+    class Believing(RunConfig):
+        def believed(self):
+            return known
+
+    Run(Believing(log_dir=folder, **options), LaggedActuator(known, "force", LAG)).train()
     return folder, options | {"start": str(folder)}
 
 

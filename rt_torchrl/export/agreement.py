@@ -129,14 +129,6 @@ def sizes(values: Float[Tensor, "n m"]) -> Float[Tensor, " m"]:
     return finite.amax(0).clamp(min=torch.finfo(torch.float64).tiny)
 
 
-def shares(
-    values: Float[Tensor, "n m"], expected: Float[Tensor, "n m"], of: Float[Tensor, " m"]
-) -> Float[Tensor, "n m"]:
-    """Differences as shares of sizes; infinite where one of both alone is not finite."""
-    equal = (values == expected) | (values.isnan() & expected.isnan())
-    return torch.where(equal, 0.0, ((values - expected).abs() / of).nan_to_num(nan=math.inf))
-
-
 def require_close(
     values: Float[Tensor, "n m"],
     expected: Float[Tensor, "n m"],
@@ -162,7 +154,8 @@ def require_close(
     Raises:
         ValueError: if the tolerance is exceeded.
     """
-    errors = shares(values, expected, of)
+    equal = (values == expected) | (values.isnan() & expected.isnan())
+    errors = torch.where(equal, 0.0, ((values - expected).abs() / of).nan_to_num(nan=math.inf))
     if errors.max() > tolerance:
         row, column = divmod(int(errors.argmax()), len(signals))
         raise ValueError(

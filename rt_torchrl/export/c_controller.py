@@ -4,12 +4,12 @@ import ctypes
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_close, shares
+from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_close
 from rt_torchrl.export.c_file import (
     TracedFunction,
     add_function,
@@ -32,24 +32,7 @@ INTERVALS = 1000
 """Greatest number of control intervals of the flight on which both are compared."""
 
 
-class ControllerAgreement(NamedTuple):
-    """The comparison of a controller in C over the first intervals of an episode that it flies.
-
-    Args:
-        difference: greatest difference of an action from that of the controller in torch, as a share of its range.
-        from_plant: greatest difference from the policy on the plant's own states, whose filters know the measured
-            states within an interval too.
-        intervals: number of intervals.
-    """
-
-    difference: float
-    from_plant: float
-    intervals: int
-
-
-def export_controller(
-    policy: nn.Module, path: Path | str, plant: Plant, *, name: str | None = None
-) -> ControllerAgreement | None:
+def export_controller(policy: nn.Module, path: Path | str, plant: Plant, *, name: str | None = None) -> float | None:
     """Write a policy as C99 with everything between the measured signals and the action.
 
     The file holds a :class:`Controller`: the plant's ``observe`` and ``actuate``, and the states that the plant names
@@ -66,7 +49,8 @@ def export_controller(
         name: prefix of the functions; by default the name of the plant with ``_controller``.
 
     Returns:
-        The comparison with the controller in torch and with the plant's own states; None without a compiler.
+        Greatest difference of an action from that of the controller in torch in the intervals that it flies, as a share
+        of its range; None without a compiler.
 
     Raises:
         ValueError: if the path or the name does not fit, the policy does not fit the plant, policy or plant cannot be
@@ -162,7 +146,7 @@ class CController:
         ]
 
     @torch.no_grad()
-    def fly(self, library: ctypes.CDLL) -> ControllerAgreement:
+    def fly(self, library: ctypes.CDLL) -> float:
         """Fly the plant by the controller in C, and give the same measurements to the controller in torch.
 
         Raises:
@@ -170,16 +154,12 @@ class CController:
         """
         plant, generator = self.controller.plant, torch.Generator().manual_seed(SEED)
         state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-        in_c, in_torch, ideal = (torch.cat(x) for x in zip(*self._actions(library, state, exogenous), strict=True))
-        of = action_sizes(plant, in_torch)
+        in_c, in_torch = (torch.cat(x) for x in zip(*self._actions(library, state, exogenous), strict=True))
         what, rows = f"the controller {self.name} in C", [f"interval {k}" for k in range(len(in_c))]
-        difference = require_close(in_c, in_torch, of, TOLERANCE, plant.actions, what, rows)
-        return ControllerAgreement(difference, shares(in_c, ideal, of).max().item(), len(in_c))
+        return require_close(in_c, in_torch, action_sizes(plant, in_torch), TOLERANCE, plant.actions, what, rows)
 
-    def _actions(
-        self, library: ctypes.CDLL, state: Tensor, exogenous: Tensor
-    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """The action of every interval in C, in torch, and with the plant's own states; the one in C acts."""
+    def _actions(self, library: ctypes.CDLL, state: Tensor, exogenous: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """The action of every interval in C and in torch; the one in C acts."""
         controller, plant, held = self.controller, self.controller.plant, self.controller.held
         memory, measured = state[:, held], state[:, controller.measured]
         command = state.new_zeros(1, len(plant.actions))
@@ -198,8 +178,7 @@ class CController:
             measured = following
             applied = self._call(library, "step", in_c, measured, inputs, len(plant.actions))
             command = state.new_tensor([list(in_c.command)])
-            expected, ideal = (controller.act(t, x, measured, inputs)[1] for x in (memory, state[:, held]))
-            yield applied, expected, ideal
+            yield applied, controller.act(t, memory, measured, inputs)[1]
             state = plant.step(t, state, command, inputs, plant.closure).state
             if not state.isfinite().all():  # the plant has left its range; what follows is no flight
                 return

@@ -12,7 +12,7 @@ from torch import nn
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached
-from rt_torchrl.export.c_controller import CController, ControllerAgreement
+from rt_torchrl.export.c_controller import CController
 from rt_torchrl.export.c_file import STRICT, compile_c, compiler, require_names, write_c
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.export.fmu import SUFFIXES
@@ -63,9 +63,7 @@ The rotor speed is that of the generator over the plant's ``gear_ratio``, becaus
 ACTIONS = ("generator_torque", "blade_pitch")
 
 
-def export_discon(
-    policy: nn.Module, path: Path | str, plant: Plant, *, name: str | None = None
-) -> ControllerAgreement | None:
+def export_discon(policy: nn.Module, path: Path | str, plant: Plant, *, name: str | None = None) -> float | None:
     """Write the controller of a turbine as a C99 file and as a shared library, which simulators load as a DISCON.
 
     The library holds the controller of :func:`export_controller`, with its filters and rate limits. It reads the

@@ -1,7 +1,6 @@
 """A finished run in code: its plant, policies, closure and results, what-if episodes and figures."""
 
 import copy
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,12 +176,10 @@ class LoadedRun:
         from rt_torchrl import figures  # here, because Matplotlib takes long to load
 
         snapshot = self._snapshot(flown)
-        recipe: Any = sys.modules.get(type(self.config).__module__)
-        own = getattr(recipe, "plant_figures", None)
         where = "on the twin" if snapshot.on_the_twin else ""
         flights = figures.flights(self.physics, {self.live: snapshot.record}, where=where)
         drawn = {"flights": flights} | figures.figures_of(snapshot)
-        return drawn | (own(snapshot) if own else {})
+        return drawn | self.config.plant_figures(snapshot)
 
     @torch.no_grad()
     def _snapshot(self, flown: Trajectory | None) -> Snapshot:

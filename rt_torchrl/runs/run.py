@@ -49,9 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
 
 
-PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
-
-
 def first_flights(unseen: UnseenEpisodes, live: Role, flights: Mapping[str, Trajectory]) -> dict[str, "Figure"]:
     """The figure of the first unseen episode under the live policy and the classical controllers."""
     idle = {role for role in ROLES if role != live}
@@ -67,14 +64,12 @@ class Run:
 
     Args:
         config: options of the run.
-        plant: the real system in simulation, and the twin's physics.
+        plant: the real system in simulation, and the twin's physics unless ``config.believed()`` names others, for which
+            policies and controllers are then made.
         env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run
             needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
             on the twin if that closure is not known. After the training the real system flies only the
             ``config.real_unseen`` episodes of each controller that are asked for.
-        believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
-            system; None if it does not.
-        plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, on the same episodes, by name. On a real system they fly
             ``config.real_unseen`` episodes, too, and a :class:`RealController` flies these alone.
         first: class of the controller that the real system has had so far, for ``start="controller"``; it is one of the
@@ -106,8 +101,6 @@ class Run:
         plant: Plant,
         *,
         env: RealSystem | Callable[[], RealSystem] | None = None,
-        believed: Plant | None = None,
-        plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
         learner: MakeLearner | None = None,
@@ -122,13 +115,12 @@ class Run:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
         self.config = config.effective()
-        self.plant_figures = plant_figures
         self.ended: str | None = None
         self.callbacks = callbacks
         device = require_device(config.device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
-        physics = known_physics(config, plant, believed, real, first, baselines).to(device)
+        physics = known_physics(config, plant, real, first, baselines).to(device)
         laws = dict(baselines or {})
         if config.start == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
@@ -393,5 +385,5 @@ class Run:
     def _pixels(self, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
         """Pixels of the figures of the training and of others, by name; each is drawn once."""
         snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
-        drawn = {**figures.figures_of(snapshot), **self.plant_figures(snapshot), **others}
+        drawn = {**figures.figures_of(snapshot), **self.config.plant_figures(snapshot), **others}
         return {name: figures.pixels(figure) for name, figure in drawn.items()}

@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
 import torch
 from pydantic import Field
@@ -29,6 +29,11 @@ from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.steps.config import PAPER, Role, TwinningConfig
 from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
+
+if TYPE_CHECKING:  # only types: an option need not wait for Matplotlib
+    from matplotlib.figure import Figure
+
+    from rt_torchrl.figures.snapshot import Snapshot
 
 Callback = Callable[[Sequence[dict[str, Any]]], str | None]
 """Function of the entries of all episodes so far, as in ``metrics.json``; it returns why the training should end, or
@@ -191,10 +196,13 @@ class RunConfig:
     def believed(self) -> Plant | None:
         """The physics of a twin that is wrong about them; None if it has those of the real system.
 
-        Override this method for a twin that is wrong, or does not know all states of the real system, and give
-        :class:`Run` what it returns.
+        Override this method for a twin that is wrong, or does not know all states of the real system.
         """
         return None
+
+    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+        """The figures by name that only this plant has; override this method to draw some."""
+        return {}
 
     def presets(self) -> dict[Preset, dict[str, Any]]:
         """The options that each preset sets; ``mpc`` is ``default`` with another method of planning.

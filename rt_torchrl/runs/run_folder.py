@@ -1,10 +1,10 @@
 """The folder of a run: its lock, its checkpoints, and its files of tensors, whose damage is noticed."""
 
 import errno
-import hashlib
 import io
 import os
 import pickle
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,9 +19,6 @@ from rt_torchrl.runs.settings import FILE, require_same, write_settings
 
 if TYPE_CHECKING:
     from rt_torchrl.algorithm import ReinforcementTwinning  # only its type: who reads weights needs no TorchRL
-
-SEAL = b"sha256:"
-"""Beginning of the comment of an archive that holds the checksum of all before it."""
 
 
 class DamagedFileError(ValueError):
@@ -39,13 +36,13 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
-    write_atomically(path, _sealed(buffer.getvalue()))
+    write_atomically(path, buffer.getvalue())
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
     """The content that :func:`save_tensors` wrote, on the CPU.
 
-    The checksum of the whole file (SHA-256) is compared first.
+    The checksums of the file, which is a zip archive, are compared first.
 
     Raises:
         DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
@@ -63,12 +60,11 @@ def load_tensors(path: Path) -> dict[str, Any]:
 def _loaded(path: Path) -> dict[str, Any]:
     file = path.read_bytes()
     try:
-        _verify(file)
-    except ValueError as error:
-        raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
-    try:
+        with zipfile.ZipFile(io.BytesIO(file)) as archive:
+            if (wrong := archive.testzip()) is not None:
+                raise DamagedFileError(f"{path} is damaged: {wrong} does not have the checksum it was written with.")
         content = torch.load(io.BytesIO(file), weights_only=True, map_location="cpu")
-    except MemoryError:
+    except (MemoryError, DamagedFileError):
         raise
     except pickle.UnpicklingError as error:
         raise DamagedFileError(
@@ -84,26 +80,6 @@ def _loaded(path: Path) -> dict[str, Any]:
     return content
 
 
-def _sealed(archive: bytes) -> bytes:
-    """The bytes of a zip archive without a comment, with a comment that holds their SHA-256."""
-    seal = SEAL + hashlib.sha256(archive).hexdigest().encode()
-    return archive[:-2] + len(seal).to_bytes(2, "little") + seal
-
-
-def _verify(file: bytes) -> None:
-    """Compare the SHA-256 of a sealed archive.
-
-    Raises:
-        ValueError: if the archive has no seal, or another checksum.
-    """
-    length = len(SEAL) + 64
-    end = file[-length:]
-    if not end.startswith(SEAL):
-        raise ValueError("it has no checksum at its end")
-    if hashlib.sha256(file[: -length - 2] + b"\0\0").hexdigest().encode() != end[len(SEAL) :]:
-        raise ValueError("it does not have the checksum that it was written with")
-
-
 def first_line(error: Exception) -> str:
     """First line of an error's message, without the advice that torch adds after it."""
     return f"({(str(error).splitlines() or [type(error).__name__])[0]})"
@@ -115,12 +91,14 @@ def plain(value: Any, place: str = "") -> Any:
     Raises:
         ValueError: if it holds anything but tensors, numbers and strings; it names the place.
     """
-    if value is None or type(value) in (bool, int, float, str):
-        return value
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().as_subclass(torch.Tensor)
-    if isinstance(value, np.generic | float | int | str):
-        return plain(value.item() if isinstance(value, np.generic) else _base(value), place)
+    value = value.item() if isinstance(value, np.generic) else value
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):  # also one of a derived class
+            return kind(value)
+    if value is None:
+        return None
     if isinstance(value, Mapping):
         return {key: plain(entry, f"{place}[{key!r}]") for key, entry in value.items()}
     if type(value) in (list, tuple, torch.Size):
@@ -130,11 +108,6 @@ def plain(value: Any, place: str = "") -> Any:
         f"{place or 'content'} of what is to be saved is a {type(value).__name__}; a state_dict may hold tensors, "
         "numbers and strings, in dicts, lists and tuples."
     )
-
-
-def _base(value: float | str) -> float | str:
-    """A number or string of a derived class as one of Python's own classes."""
-    return next(kind(value) for kind in (float, int, str) if isinstance(value, kind))
 
 
 FORMAT = 5

@@ -171,7 +171,6 @@ CHECKED_STEPS = 10
 def known_physics(
     config: RunConfig,
     plant: Plant,
-    believed: Plant | None,
     real: RealSystem | None,
     first: type[ClassicalController] | None,
     baselines: dict[str, type[Baseline]] | None,
@@ -182,8 +181,10 @@ def known_physics(
         PlantContractError: if a plant breaks its contract.
         ValueError: if options, controllers, the twin's physics and the real system do not go together.
     """
+    require_plant("plant", plant)
     require_simulation(config, plant, real, baselines)
-    physics = require_physics(plant, believed)
+    believed = config.believed()
+    physics = require_physics(plant, believed or plant)
     for one in filter(None, (plant, believed)):
         check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
     require_controllers(physics, first, baselines)
@@ -242,25 +243,21 @@ def require_controllers(
             require_controller(name, law, physics)
 
 
-def require_physics(plant: Plant, believed: Plant | None) -> Plant:
+def require_physics(plant: Plant, physics: Plant) -> Plant:
     """The physics of the twin of a real system.
 
     Args:
         plant: the real system.
-        believed: physics that the twin is given; None for those of the real system.
+        physics: physics of the twin.
 
     Raises:
-        ValueError: if one is no plant, or the twin has states that no sensor of the real system reads, or lacks some
-            that one reads.
+        ValueError: if the twin has states that no sensor of the real system reads, or lacks some that one reads.
     """
-    require_plant("plant", plant)
-    if believed is not None:
-        require_plant("believed", believed)
-    physics = believed or plant
     known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
     if known != read:
         raise ValueError(
             f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
-            f"{', '.join(read)}, which is all that sensors read; give believed, the plant without its extensions."
+            f"{', '.join(read)}, which is all that sensors read; let believed() of the Config give the plant without "
+            "its extensions."
         )
     return physics

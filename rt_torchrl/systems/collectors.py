@@ -21,7 +21,7 @@ from rt_torchrl.plants.plant import Plant, with_memories
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
-from rt_torchrl.trajectories.engines.code import require_pure_policy
+from rt_torchrl.trajectories.engines.code import ImpureError, require_pure_policy
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
@@ -115,37 +115,62 @@ class EpisodeCollector(BaseCollector):
             DivergenceError: if the system is a simulation that diverges.
             ImpureError: if the policy is no function of the observation.
         """
-        flown: list[TensorDictBase] = []
-        plant = self._plant
-        pass_over(self.env)
-        try:
-            now = self.env.reset()
-        except DivergenceError:
-            raise
-        except Exception as error:  # whatever a machine, its driver or its connection may raise
-            raise EpisodeEndedError(failure(error, plant), None) from error
-        if not isinstance(self.actor.policy, StateFeedback):
-            require_pure_policy(self.actor.policy, now["observation"])
-        for k in range(plant.n_steps):
-            asked = self._acting(now)
-            try:
-                stepped = self.env.step(asked)
-            except DivergenceError:
-                raise
-            except Exception as error:
-                raise EpisodeEndedError(failure(error, plant, k), together(flown)) from error
-            flown.append(stepped.copy())
-            if terminated(stepped["next"], plant):
-                break
-            if stepped["next", "done"].any() and k + 1 < plant.n_steps:
-                raise EpisodeEndedError(str(ended_early(stepped["next"], k + 1, plant)), together(flown))
-            now = self.env.step_mdp(stepped)
+        flown, why = fly(self.env, self._begin, lambda k, row: self._acting(row), self._plant)
+        if why is not None:
+            raise EpisodeEndedError(why, together(flown))
         return cast(TensorDict, together(flown))
 
+    def _begin(self) -> TensorDictBase:
+        pass_over(self.env)
+        begun = self.env.reset()
+        if not isinstance(self.actor.policy, StateFeedback):
+            require_pure_policy(self.actor.policy, begun["observation"])
+        return begun
 
-def terminated(found: TensorDictBase, plant: Plant) -> bool:
-    """Whether the end of an interval is the early end of an episode."""
-    return plant.end_cost is not None and bool(found["terminated"].any())
+
+def fly(
+    env: EnvBase,
+    begin: Callable[[], TensorDictBase],
+    act: Callable[[int, TensorDictBase], TensorDictBase],
+    plant: Plant,
+) -> tuple[list[TensorDictBase], str | None]:
+    """Step a system from its beginning to the end of an episode.
+
+    Args:
+        env: the system.
+        begin: function that begins the episode and returns what is read first.
+        act: function that adds the action to what is read in interval k.
+        plant: plant that gives the length of an episode.
+
+    Returns:
+        The control intervals, and why the episode has ended before its horizon where the plant does not end it, such as
+        an error of the system; None if it has not.
+
+    Raises:
+        DivergenceError: if the system is a simulation that diverges.
+    """
+    flown: list[TensorDictBase] = []
+    try:
+        row = begin()
+    except (DivergenceError, ImpureError):
+        raise
+    except Exception as error:  # whatever a machine, its driver or its connection may raise
+        return flown, failure(error, plant)
+    for k in range(plant.n_steps):
+        asked = act(k, row)
+        try:
+            stepped = env.step(asked)
+        except DivergenceError:
+            raise
+        except Exception as error:
+            return flown, failure(error, plant, k)
+        flown.append(stepped.copy())
+        if plant.end_cost is not None and stepped["next", "terminated"].any():
+            break
+        if stepped["next", "done"].any() and k + 1 < plant.n_steps:
+            return flown, str(ended_early(stepped["next"], k + 1, plant))
+        row = env.step_mdp(stepped)
+    return flown, None
 
 
 def together(flown: list[TensorDictBase]) -> TensorDictBase | None:

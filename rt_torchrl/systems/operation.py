@@ -23,14 +23,12 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.collectors import failure, pass_over
+from rt_torchrl.systems.collectors import fly, pass_over, together
 from rt_torchrl.systems.config import OperationConfig
-from rt_torchrl.systems.environment import ended_early
 from rt_torchrl.systems.exploration import BumplessPolicy, ExplorationConfig
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyReport
 from rt_torchrl.systems.sound_part import EpisodeEndedError, report_of
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 FIRST = "first"
@@ -80,16 +78,21 @@ class Window(NamedTuple):
     """A window of operation, or the part of it before the system failed.
 
     Attributes:
-        entries: its control intervals, of batch size ``1 k``; None if there are none.
+        entries: its control intervals, of batch size ``1 k``, None if there are none; before they are :meth:`stacked`,
+            a list of them.
         ended: why the system did not reach the end of the window; None if it did.
         report: what the safety layer did in it; None if there is no layer.
         acted: numbers about what acted at its end, such as the times of the solves of model predictive control.
     """
 
-    entries: TensorDict | None
+    entries: TensorDict | list[TensorDictBase] | None
     ended: str | None = None
     report: SafetyReport | None = None
     acted: Mapping[str, float] | None = None
+
+    def stacked(self) -> "Window":
+        """The window with its control intervals in one TensorDict."""
+        return self._replace(entries=together(self.entries)) if isinstance(self.entries, list) else self
 
 
 class Pace:
@@ -142,7 +145,7 @@ class Pace:
 
 
 class Operator:
-    """Steps a real system under the policies that it is ordered to follow, interval by interval.
+    """Steps a real system under the policies that it is ordered to follow.
 
     A window of operation has the length of the plant's episode. Without ``continuous`` it begins with a reset, as an
     episode does. With ``continuous`` only the first one does: state, offset of a handover and memory of state feedback
@@ -178,10 +181,8 @@ class Operator:
     ):
         self._make_env, self._exploration, self._seed = make_env, exploration, seed
         self.plant, self.policies, self.config = plant, policies, config
-        self.interval, self._begun = 0, False
+        self._begun = False
         self._order: Order | None = None
-        self._window: TensorDict | None = None
-        self._row: TensorDictBase | None = None
 
     def start(self) -> None:
         """Make the real system, and what acts on it."""
@@ -192,11 +193,6 @@ class Operator:
         pace: Pace | None = getattr(self.env, "pace", None)
         self._keeps_time = pace is None
         self.pace = Pace(self.plant.dt / self.config.speed) if pace is None else pace
-
-    @property
-    def length(self) -> int:
-        """Number of control intervals of a window."""
-        return self.plant.n_steps
 
     @property
     def version(self) -> int:
@@ -211,100 +207,62 @@ class Operator:
             made: its policy, ready to act; None makes it.
         """
         policy = order.ready(self.policies) if made is None else made
-        if self._order is not None and (self.config.continuous or self.interval % self.length):
+        if self._begun:
             self.actor.hand_over(policy, strength=order.strength)
         else:
             self.actor.policy = policy
         self._order = order
 
     @torch.no_grad()
-    def step(self) -> Window | None:
-        """Act for one control interval.
+    def window(self, receive: Callable[[], None] = lambda: None) -> Window:
+        """Act for a window.
 
-        Returns:
-            The window that ends with this interval; None within a window.
+        Args:
+            receive: function that is called before each interval, and may give orders to :meth:`follow`.
 
         Raises:
             ValueError: if there is no order yet.
             DivergenceError: if the system is a simulation that diverges.
         """
+        receive()
         if self._order is None:
             raise ValueError("nothing acts yet: give the operator its first order.")
-        k = self.interval % self.length
-        if k == 0:
-            try:
-                self._begin()
-            except DivergenceError:
-                raise
-            except Exception as error:  # whatever a machine, its driver or its connection may raise
-                return self._ended(0, failure(error, self.plant))
-        if self._keeps_time:
-            self.pace.wait()
-        return self._interval(k)
 
-    def _interval(self, k: int) -> Window | None:
-        """Act in interval k of the window that has begun."""
-        assert self._row is not None
-        row = self._row.set("action", self.actor(self._row["observation"], self._row["state"], self._row["exogenous"]))
-        try:
-            row = self.env.step(row)
-            self._store(k, row)
-        except DivergenceError:
-            raise
-        except Exception as error:
-            return self._ended(k, failure(error, self.plant, k))
-        self._row = self.env.step_mdp(row)
-        self.interval += 1
-        if k + 1 < self.length:
-            early = row["next", "done"].any()
-            return self._ended(k + 1, str(ended_early(row["next"], k + 1, self.plant))) if early else None
-        return Window(self._window, report=report_of(self.env), acted=self._acted())
+        def act(k: int, row: TensorDictBase) -> TensorDictBase:
+            if k:
+                receive()
+            if self._keeps_time:
+                self.pace.wait()
+            row["version"] = torch.full((1, 1), self.version)
+            row["late"] = torch.full((1, 1), self.pace.late, dtype=torch.float64)
+            return row.set("action", self.actor(row["observation"], row["state"], row["exogenous"]))
 
-    def _begin(self) -> None:
-        """Begin a window."""
+        rows, why = fly(self.env, self._begin, act, self.plant)
+        self._begun = self.config.continuous and why is None
+        policy = self.actor.policy
+        acted = policy.report() if isinstance(policy, StateFeedback) else None
+        return Window(rows, why, report_of(self.env), acted) if rows else Window(rows, why)
+
+    def _begin(self) -> TensorDictBase:
+        """Begin a window, and return what is read first."""
         assert self._order is not None
         if self._begun:
             assert isinstance(self.env, RealSystem)
-            self._row = self.env.go_on()
             self.actor.begin_window()
-        else:
-            pass_over(self.env)
-            self._row = self.env.reset()
-            self.actor.begin(self.actor.policy, strength=self._order.strength)
-            if self._keeps_time:
-                self.pace.begin()
-        self._begun, self._window = self.config.continuous, None
-
-    def _ended(self, count: int, why: str) -> Window:
-        """The window of which ``count`` intervals were acted in; the next one begins with a reset."""
-        entries = None if self._window is None or not count else self._window[:, :count].clone()
-        self.interval, self._begun = (self.interval // self.length + 1) * self.length, False
-        return Window(entries, why, report_of(self.env) if count else None, self._acted() if count else None)
-
-    def _acted(self) -> dict[str, float] | None:
-        """Numbers about state feedback that acts."""
-        policy = self.actor.policy
-        return policy.report() if isinstance(policy, StateFeedback) else None
-
-    def _store(self, k: int, row: TensorDictBase) -> None:
-        """Copy an interval into the window, which is allocated at once because a stack at its end takes long."""
-        assert self._order is not None
-        if self._window is None:
-            self._window = row.clone().unsqueeze(1).expand(1, self.length).clone()
-            for name, kind in (("version", torch.int64), ("late", torch.float64)):
-                self._window[name] = torch.zeros(1, self.length, 1, dtype=kind)
-            self._places = [(self._window[key], key) for key in row.keys(True, True)]
-            self._version, self._late = self._window["version"], self._window["late"]
-        for place, key in self._places:
-            place[:, k] = row[key]
-        self._version[:, k], self._late[:, k] = self._order.version, self.pace.late
+            return self.env.go_on()
+        pass_over(self.env)
+        begun = self.env.reset()
+        self.actor.begin(self.actor.policy, strength=self._order.strength)
+        if self._keeps_time:
+            self.pace.begin()
+        self._begun = True
+        return begun
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on, at the end of a window."""
         return {
             "env": self.env.state_dict(),
             "generator": self.actor.generator.get_state(),
-            "interval": self.interval,
             "order": None if self._order is None else self._order._asdict(),
         }
 
@@ -315,7 +273,6 @@ class Operator:
         """
         self.env.load_state_dict(state["env"])
         self.actor.generator.set_state(state["generator"].cpu())
-        self.interval = state["interval"]
         self._order, self._begun = None, False
         if state["order"] is not None:
             self.follow(Order(**state["order"]))
@@ -437,6 +394,7 @@ class Operation:
             acting: version that acts at its end.
         """
         entries, self.report, self.acted = window.entries, window.report, window.acted
+        assert not isinstance(entries, list)
         versions = [] if entries is None else entries["version"].flatten().tolist()
         oldest = min([acting, *versions])
         self.orders = {version: order for version, order in self.orders.items() if version >= oldest}
@@ -521,26 +479,37 @@ def act(connection: Connection, pickled: bytes, state: bytes | None) -> None:
     sender.join()
 
 
+class _Stopped(Exception):
+    """The learner says stop, or has gone."""
+
+
 def _operate(
     operator: Operator, state: dict[str, Any] | None, orders: SimpleQueue[Any], windows: SimpleQueue[Any]
 ) -> None:
     operator.start()
+
+    def follow(order: Any) -> None:
+        if order == STOP:
+            raise _Stopped
+        if isinstance(order, Exception):  # of the receiving thread
+            raise order
+        operator.follow(*order)
+
+    def receive() -> None:
+        while not orders.empty():
+            follow(orders.get())
+
     try:
         if state is not None:
             operator.load_state_dict(state)
-        order = orders.get()
+        follow(orders.get())
         gc.collect()
         gc.freeze()  # a collection of all objects that the libraries have made would stop an action
-        while order != STOP:
-            if isinstance(order, Exception):  # of the receiving thread
-                raise order
-            if order is not None:
-                operator.follow(*order)
-            if orders.empty():  # otherwise the next order comes at once
-                window = operator.step()
-                if window is not None:
-                    windows.put(("window", window, operator.state_dict()))
-            order = None if orders.empty() else orders.get()
+        while True:
+            window = operator.window(receive)
+            windows.put(("window", window, operator.state_dict()))
+    except _Stopped:
+        return
     finally:
         gc.unfreeze()  # otherwise libraries report at the end of the process what nobody has freed
         operator.env.close()
@@ -560,7 +529,10 @@ def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[st
 
 def _send(connection: Connection, windows: SimpleQueue[Any]) -> None:
     try:
-        while (window := windows.get()) is not None:
-            connection.send_bytes(pickle.dumps(window))
+        while (message := windows.get()) is not None:
+            kind, *parts = message
+            # The stack of a window takes long, and would keep the control loop waiting.
+            parts = [part.stacked() if isinstance(part, Window) else part for part in parts]
+            connection.send_bytes(pickle.dumps((kind, *parts)))
     except OSError:
         return  # a learner that has gone
