@@ -30,7 +30,6 @@ from rt_torchrl.fit.resampling import (
 from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.options import Count, Positive
 from rt_torchrl.runs.command_line import plant_class
-from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_folder import save_tensors
 
 SHOWN = ("before", "after", "standard_error")
@@ -45,7 +44,6 @@ class Config:
         log: CSV or Parquet file with a column for the time, each action, each exogenous input and each measured state.
         plant: plant of the log, as the name of a folder under envs, or as FILE.py:NAME or package.module:NAME of your
             own.
-        recipe: recipe whose Config makes the plant instead, with default options.
         columns: columns with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
             HEADER=SIGNAL*FACTOR+OFFSET.
         drop: leave out rows with a value that is missing or out of range; they become gaps.
@@ -63,8 +61,7 @@ class Config:
     """
 
     log: Annotated[Path, tyro.conf.Positional]
-    plant: str | None = None
-    recipe: Path | None = None
+    plant: str
     columns: tuple[str, ...] = ()
     drop: bool = False
     missing: bool = False
@@ -80,31 +77,22 @@ class Config:
     estimation: EstimationConfig = field(default_factory=lambda: EstimationConfig(errors="robust"))
 
     def __post_init__(self):
-        if (self.plant is None) == (self.recipe is None):
-            raise ValueError("the physics is not known: give one of --plant and --recipe.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder of its own for the results.")
 
     def make_plant(self) -> Plant:
         """The plant with the requested control interval."""
-        make = plant_class(self.plant) if self.plant else self._plant_of_recipe
+        make = plant_class(self.plant)
         try:
             plant = make()
             if self.dt is None:
                 return plant
             return make(dt=self.dt, horizon=max(1, round(plant.horizon / self.dt)) * self.dt)
         except TypeError as error:
-            source = f"plant={self.plant!r}" if self.plant else f"recipe={self.recipe}"
             raise ValueError(
-                f"{source} cannot be made ({error}): its options must have defaults, and for --dt it needs dt and "
-                "horizon. A recipe with a method plant() can fill them in."
+                f"plant={self.plant!r} cannot be made ({error}): its options must have defaults, and for --dt it needs "
+                "dt and horizon. A class of your own that derives from it can fill them in."
             ) from error
-
-    def _plant_of_recipe(self, **options: float) -> Plant:
-        config = dataclasses.replace(config_class_of(self.recipe)(), **options)
-        if not hasattr(config, "plant"):
-            raise ValueError(f"recipe={self.recipe}: its Config has no method plant(); write one, or give --plant.")
-        return config.plant()
 
     def guesses(self) -> dict[str, float]:
         """First guesses of hidden states, by name."""

@@ -259,11 +259,8 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tm
         ({"dt": 60.0}, "unstable"),
         ({"dt": 0.0}, "dt=0.0 must be greater than 0"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
-        ({"plant": None}, "give one of --plant and --recipe"),
-        ({"recipe": RECIPES / "wind_turbine.py"}, "give one of --plant and --recipe"),
         ({"plant": "gone.py:Room"}, "gone.py does not exist"),
         ({"plant": "rt_torchrl:Signal"}, "plant='rt_torchrl:Signal' is no class derived from Plant"),
-        ({"plant": None, "recipe": RECIPES / "identify.py"}, "has no class Config derived from RunConfig"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
 )
@@ -275,18 +272,6 @@ def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
     assert not list(tmp_path.iterdir())
 
 
-OWN = """
-from rt_torchrl import RunConfig, configuration
-from own_turbine import Own
-@configuration
-class Config(RunConfig):
-    dt: float = 0.5
-    horizon: float = 30.0
-    def plant(self):
-        return Own(dt=self.dt, horizon=self.horizon)
-def main(config):
-    pass
-"""
 OWN_PLANT = """
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 class Own(WindTurbine):
@@ -297,13 +282,12 @@ class Demanding(WindTurbine):
 """
 
 
-def test_an_own_plant_is_made_by_its_file_or_its_recipe(tmp_path):
-    (tmp_path / "own_turbine.py").write_text(OWN_PLANT), (tmp_path / "own_recipe.py").write_text(OWN)
+def test_an_own_plant_is_made_by_its_file(tmp_path):
     identify, file = recipe("identify"), tmp_path / "own_turbine.py"
-    for options in ({"plant": f"{file}:Own"}, {"recipe": tmp_path / "own_recipe.py"}):
-        own = identify.Config(log=file, **options).make_plant()
-        faster = identify.Config(log=file, dt=0.25, **options).make_plant()
-        assert own.name == faster.name == "own" and (own.dt, faster.dt) == (0.5, 0.25)
-        assert own.horizon == faster.horizon
+    file.write_text(OWN_PLANT)
+    own = identify.Config(log=file, plant=f"{file}:Own").make_plant()
+    faster = identify.Config(log=file, plant=f"{file}:Own", dt=0.25).make_plant()
+    assert own.name == faster.name == "own" and (own.dt, faster.dt) == (0.5, 0.25)
+    assert own.horizon == faster.horizon
     with pytest.raises(ValueError, match="cannot be made .*blades.*its options must have defaults"):
         identify.Config(log=file, plant=f"{file}:Demanding").make_plant()

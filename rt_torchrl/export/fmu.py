@@ -5,7 +5,8 @@ import platform
 import sys
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from uuid import uuid4
@@ -41,15 +42,12 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_c` refuses the
             policy.
     """
-    cc = _compiler_for(path)
     name, inputs = f"{plant.name}_policy", [("observation", signal) for signal in plant.observations]
     outputs = [("action", signal) for signal in plant.actions]
     values = [0.0] * (len(inputs) + len(outputs))
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder, "policy.c")
-        export_c(policy, source, plant, function=name)
-        calls = {"@OUTPUT@": f"{name}(v, v + {len(inputs)});", "@STEP@": "(void)t;"}
-        _write(path, cc, name, plant.dt, inputs, outputs, values, source, calls)
+    calls = {"@OUTPUT@": f"{name}(v, v + {len(inputs)});", "@STEP@": "(void)t;"}
+    write = partial(export_c, policy, plant=plant, function=name)
+    _write(path, name, plant.dt, inputs, outputs, values, calls, write)
 
 
 def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0) -> None:
@@ -68,57 +66,47 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
         ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_twin` refuses the
             twin.
     """
-    cc = _compiler_for(path)
     name, n_a = f"{plant.name}_twin", len(plant.actions)
     inputs = [("command", s) for s in plant.actions] + [("exogenous", s) for s in plant.inputs]
     n, outputs = len(inputs), [("state", signal) for signal in plant.states]
     values = [0.0] * n + plant.draw_initial_state(1, torch.Generator().manual_seed(seed))[0].tolist()
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder, "twin.c")
-        export_twin(closure, source, plant, name=name)
-        calls = {"@OUTPUT@": "(void)v;", "@STEP@": f"{name}_step(t, v + {n}, v, v + {n_a}, v + {n});"}
-        _write(path, cc, name, plant.dt, inputs, outputs, values, source, calls)
+    calls = {"@OUTPUT@": "(void)v;", "@STEP@": f"{name}_step(t, v + {n}, v, v + {n_a}, v + {n});"}
+    _write(path, name, plant.dt, inputs, outputs, values, calls, partial(export_twin, closure, plant=plant, name=name))
 
 
-def _compiler_for(path: Path | str) -> str:
-    """The compiler for the FMU that is to be written, before the work that it is for.
+def _write(
+    path: Path | str,
+    name: str,
+    dt: float,
+    inputs: Variables,
+    outputs: Variables,
+    values: Sequence[float],
+    calls: dict[str, str],
+    write: Callable[[Path], object],
+) -> None:
+    """Write an FMU around the C file that ``write`` makes.
 
     Raises:
         ValueError: if the path does not end in ``.fmu``, or there is no C compiler.
     """
     if Path(path).suffix != ".fmu":
         raise ValueError(f"path={path} of an FMU must end in .fmu.")
-    cc = compiler()
+    cc, token, content = compiler(), f"{{{uuid4()}}}", io.BytesIO()
     if cc is None:
         raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
-    return cc
-
-
-def _write(
-    path: Path | str,
-    cc: str,
-    name: str,
-    dt: float,
-    inputs: Variables,
-    outputs: Variables,
-    values: Sequence[float],
-    source: Path,
-    calls: dict[str, str],
-) -> None:
-    token, content = f"{{{uuid4()}}}", io.BytesIO()
-    text = files("rt_torchrl.export").joinpath("fmu.c").read_text(encoding="utf-8")
-    words = {"@HEADER@": source.with_suffix(".h").name, "@COUNT@": str(len(values)), "@GUID@": token}
+    words = {"@HEADER@": f"{name}.h", "@COUNT@": str(len(values)), "@GUID@": token}
     words |= {"@INTERVAL@": repr(dt), "@VALUES@": ", ".join(map(repr, values))}
+    text = files("rt_torchrl.export").joinpath("fmu.c").read_text(encoding="utf-8")
     for word, value in (words | calls).items():
         text = text.replace(word, value)
-    # One unit of translation, so that one call of the compiler makes the library.
-    wrapper = source.with_name(f"{name}_fmu.c")
-    wrapper.write_text(text + source.read_text(encoding="utf-8"), encoding="utf-8")
-    library = compile_c(cc, wrapper)
-    folder = f"{SYSTEMS.get(sys.platform, 'linux')}{platform.architecture()[0].removesuffix('bit')}"
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as fmu:
+    place = f"{SYSTEMS.get(sys.platform, 'linux')}{platform.architecture()[0].removesuffix('bit')}"
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as fmu:
+        source, wrapper = Path(folder, f"{name}.c"), Path(folder, f"{name}_fmu.c")
+        write(source)
+        # One unit of translation, so that one call of the compiler makes the library.
+        wrapper.write_text(text + source.read_text(encoding="utf-8"), encoding="utf-8")
         fmu.writestr("modelDescription.xml", description(name, token, dt, inputs, outputs, values))
-        fmu.write(library, f"binaries/{folder}/{name}{SUFFIXES.get(sys.platform, '.so')}")
+        fmu.write(compile_c(cc, wrapper), f"binaries/{place}/{name}{SUFFIXES.get(sys.platform, '.so')}")
         for file in (wrapper, source.with_suffix(".h")):
             fmu.write(file, f"sources/{file.name}")
     write_atomically(Path(path), content.getvalue())

@@ -2,9 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,10 +15,8 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import (
     Baseline,
     Judged,
-    RealEpisodes,
     TwinEpisodes,
     UnseenEpisodes,
-    mean_with_confidence,
 )
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
@@ -164,22 +161,12 @@ def end_operation(algorithm: ReinforcementTwinning) -> None:
         algorithm.operating.operation.close()
 
 
-class RealFlights(NamedTuple):
-    """What a controller has flown on the real system after the training, and what that cost."""
-
-    flown: Trajectory
-    judged: Judged
-
-
 def contenders(
     config: RunConfig,
-    system: RealSystem,
     algorithm: ReinforcementTwinning,
     untrained: Mapping[Role, nn.Module],
     baselines: Mapping[str, Baseline],
-    *,
-    device: torch.device,
-) -> dict[str, Callable[[], Trajectory]]:
+) -> dict[str, nn.Module]:
     """The controllers that are to fly the real system after the training, by name.
 
     These are the live policy, unless it still has the random weights that it began with, and the controllers that are
@@ -187,22 +174,16 @@ def contenders(
 
     Args:
         config: options of the run.
-        system: the real system.
         algorithm: the training at its end.
         untrained: the policies before it.
         baselines: controllers that are judged beside the policies, with the one that the training has begun with.
-        device: device of the twin.
     """
-    found: dict[str, Callable[[], Trajectory]] = {}
     if not config.real_unseen:
-        return found
-    asked = RealEpisodes(system, config.real_unseen, device=device)
+        return {}
     live = algorithm.referee.live
     policy = algorithm.policies[live]
-    known = config.start != "random" or isinstance(policy, StateFeedback)
-    if known or not clones(policy, untrained[live]):
-        found[live] = partial(asked.fly, policy)
-    return found | {name: partial(asked.fly, law) for name, law in baselines.items()}
+    known = config.start != "random" or isinstance(policy, StateFeedback) or not clones(policy, untrained[live])
+    return ({live: policy} if known else {}) | dict(baselines)
 
 
 def announcement(names: Iterable[str], live: Role, count: int) -> str:
@@ -212,35 +193,34 @@ def announcement(names: Iterable[str], live: Role, count: int) -> str:
     return f"{count * len(called)} flights on the real system: {each}; they count as paid"
 
 
-def entries(flights: Mapping[str, RealFlights], live: Role, J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:
-    """The entry ``real_unseen`` of the summary.
+def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role) -> dict[str, Any]:
+    """The entry ``real_unseen`` of the summary, without J_p.
+
+    Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
+    the other one, and ``cheaper`` the number of episodes in which it is cheaper.
 
     Args:
         flights: flights by the name of the controller.
+        judged: what these cost.
         live: name of the live policy, which need not have flown.
-        J_p: costs of the twin on the flights of the live policy, by name; empty without such flights.
     """
+    controllers = {}
+    for name, found in judged.items():
+        costs = found.control_costs
+        controllers[name] = {"episodes": len(costs)} | found.statistics()
+        if name != live and live in flights and _same_episodes(flights[name], flights[live]):
+            best = judged[live].control_costs
+            ratio = (best.mean() / costs.mean()).item()
+            controllers[name] |= {"ratio": ratio, "cheaper": int((best < costs).sum())}
     return {
-        "controllers": {
-            name: {"episodes": len(one.judged.control_costs)}
-            | one.judged.statistics()
-            | (beside(flights[live], one) if live in flights else {})
-            for name, one in flights.items()
-        },
-        "costs": {name: one.judged.control_costs.tolist() for name, one in flights.items()},
-    } | {name: mean_with_confidence(costs) for name, costs in J_p.items()}
+        "controllers": controllers,
+        "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
+    }
 
 
-def beside(live: RealFlights, other: RealFlights) -> dict[str, Any]:
-    """What the live policy costs over another controller, where both flew the same episodes; nothing elsewhere.
-
-    ``ratio`` is that of the means, and ``cheaper`` the number of episodes in which the live policy is cheaper.
-    """
-    same = torch.equal(live.flown.states[:, 0], other.flown.states[:, 0])
-    if live is other or not (same and torch.equal(live.flown.exogenous, other.flown.exogenous)):
-        return {}
-    costs, others = live.judged.control_costs, other.judged.control_costs
-    return {"ratio": (costs.mean() / others.mean()).item(), "cheaper": int((costs < others).sum())}
+def _same_episodes(flown: Trajectory, other: Trajectory) -> bool:
+    starts = flown.states[:, 0], other.states[:, 0]
+    return torch.equal(*starts) and torch.equal(flown.exogenous, other.exogenous)
 
 
 def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
@@ -268,8 +248,3 @@ def paid_before(folder: Path) -> list[float | None]:
         return []
     before: list[float | None] = read_metrics(folder)["summary"]["cost_of_learning"].get("judging", [])
     return before
-
-
-def paid(flights: Mapping[str, RealFlights]) -> list[float]:
-    """J_a of every flight."""
-    return [cost for one in flights.values() for cost in one.judged.control_costs.tolist()]

@@ -16,7 +16,14 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
-from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import (
+    Baseline,
+    Judged,
+    RealController,
+    RealEpisodes,
+    UnseenEpisodes,
+    mean_with_confidence,
+)
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
@@ -24,7 +31,6 @@ from rt_torchrl.runs import real_side, results
 from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress
 from rt_torchrl.runs.real_side import (
-    RealFlights,
     end_operation,
     judged_on,
     learner_threads,
@@ -64,8 +70,8 @@ class Run:
 
     Args:
         config: options of the run.
-        plant: the real system in simulation, and the twin's physics unless ``config.believed()`` names others, for which
-            policies and controllers are then made.
+        plant: the real system in simulation, and the physics of the twin unless ``config.believed()`` names others, for
+            which policies and controllers are then made.
         env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run
             needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
             on the twin if that closure is not known. After the training the real system flies only the
@@ -141,7 +147,6 @@ class Run:
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
-            self._judged: dict[str, Any] | None = None
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
@@ -319,48 +324,47 @@ class Run:
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
             self.episodes = load_checkpoint(self.folder, self.algorithm)
 
-    def _fly_the_real_system(self, bar: Progress) -> dict[str, RealFlights]:
-        """The flights after the training that were asked for; before the first one the run says how many of whom."""
-        if self._real is None:
-            return {}
-        if len(self.episodes) < self.config.episodes and self.ended is None:
-            return {}  # who has pressed Ctrl-C does not want the real system to go on
-        parts = self.initial_policies, self.baselines
-        found = real_side.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
-        live = self.algorithm.referee.live
-        if self.config.real_unseen and live not in found:
-            bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
-        self._judged = real_side.judged_before(self.folder, len(self.episodes), found, self.config.real_unseen)
-        if self._judged:
-            bar.write("the real system has been flown after these episodes; it is not flown again")
-            return {}
-        if found:
-            bar.write(real_side.announcement(found, live, self.config.real_unseen))
-            bar.doing("judging on the real system")
-        flown = {name: fly() for name, fly in found.items()}
-        return {name: RealFlights(one, self._on_the_real_system(one).judge(one)) for name, one in flown.items()}
+    def _fly_the_real_system(self, bar: Progress) -> dict[str, Any] | None:
+        """The entry ``real_unseen`` of the summary, if flights of the real system were asked for.
 
-    def _on_the_real_system(self, flown: Trajectory) -> RealEpisodes:
-        """What judges flights of the real system."""
-        assert self._real is not None
-        found = RealEpisodes(self._real, len(flown.states), device=self._device)
-        found.bounds = self.unseen.bounds
-        return found
+        Before the first flight the run says how many of whom. Who has pressed Ctrl-C does not want the system to go on.
+        """
+        config, live = self.config, self.algorithm.referee.live
+        if self._real is None or (len(self.episodes) < config.episodes and self.ended is None):
+            return None
+        laws = real_side.contenders(config, self.algorithm, self.initial_policies, self.baselines)
+        if config.real_unseen and live not in laws:
+            bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
+        if before := real_side.judged_before(self.folder, len(self.episodes), laws, config.real_unseen):
+            bar.write("the real system has been flown after these episodes; it is not flown again")
+            return before
+        if not laws:
+            return None
+        bar.write(real_side.announcement(laws, live, config.real_unseen))
+        bar.doing("judging on the real system")
+        episodes = RealEpisodes(self._real, config.real_unseen, device=self._device)
+        episodes.bounds = self.unseen.bounds
+        flights = {name: episodes.fly(law) for name, law in laws.items()}
+        judged = {name: episodes.judge(flown) for name, flown in flights.items()}
+        self._paid += [cost for found in judged.values() for cost in found.control_costs.tolist()]
+        entry = real_side.entries(flights, judged, live)
+        if live in flights:
+            costs = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
+            entry |= {name: mean_with_confidence(cost) for name, cost in zip(("J_p", "J_p_before"), costs, strict=True)}
+        return entry
 
     def _results(
         self,
         gap: float,
         flights: dict[str, Trajectory],
         judged: dict[str, Judged],
-        real: dict[str, RealFlights],
+        real: dict[str, Any] | None,
     ) -> dict[str, Any]:
         parts = self.initial_policies, self.initial_closure, self.episodes
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
-        if real:
-            summary["real_unseen"] = self._real_results(real)
-        elif self._judged:
-            summary["real_unseen"] = self._judged
-        summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_side.paid(real)])
+        if real is not None:
+            summary["real_unseen"] = real
+        summary["cost_of_learning"] = results.cost_of_learning(self.episodes, self._paid)
         better = judged[summary["better"]].control_costs
         summary |= results.reference_entry(self.config, self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
@@ -372,15 +376,6 @@ class Run:
         save_tensors(self.folder / "weights.pt", weights | self.algorithm.twin.state_dict())
         write_json(self.folder / "metrics.json", metrics)
         return metrics
-
-    def _real_results(self, real: dict[str, RealFlights]) -> dict[str, Any]:
-        live = self.algorithm.referee.live
-        flown, J_p = real.get(live), {}
-        if flown is not None:
-            on_it = self._on_the_real_system(flown.flown)
-            costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
-            J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
-        return real_side.entries(real, live, J_p)
 
     def _pixels(self, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
         """Pixels of the figures of the training and of others, by name; each is drawn once."""

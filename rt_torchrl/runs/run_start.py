@@ -16,11 +16,10 @@ from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
 from rt_torchrl.runs.run_folder import checkpoints
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.steps.config import ROLES, Role
+from rt_torchrl.steps.config import ROLES
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 from rt_torchrl.systems.real_system import RealSystem
@@ -95,14 +94,14 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
             )
     _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
     hypotheses = _hypotheses(folder, run.twin, config, plant)
-    arm = run.config.twinning.arm
+    arm, live = run.config.twinning.arm, run.live
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
         return EarlierPolicies(
             {role: policy.to(config.device) for role, policy in policies.items()},
             run.closure.to(config.device),
-            _live(folder),
+            live,
             hypotheses,
         )
 
@@ -139,14 +138,6 @@ def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant)
             "--twinning.hypotheses.which of that run, or --twinning.hypotheses.which none to plan on the twin alone."
         ) from error
     return found
-
-
-def _live(folder: Path) -> Role:
-    """The role that was live at the end of a run."""
-    role = read_metrics(folder)["summary"].get("live")
-    if role not in ROLES:
-        raise ValueError(f"metrics.json in {folder} says that {role!r} was live; it must be {' or '.join(ROLES)}.")
-    return role
 
 
 def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:

@@ -18,10 +18,11 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant, with_memories
+from rt_torchrl.programs.contract import ImpureError
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
-from rt_torchrl.trajectories.engines.code import ImpureError, require_pure_policy
+from rt_torchrl.trajectories.engines.code import require_pure_policy
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite

@@ -251,13 +251,28 @@ def _strange_starts(plant: Plant, flown: Flown) -> Iterator[str]:
     """Which states are read at the start far outside what the plant draws, as from a wrong zero or other starts."""
     drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
     starts = flown.states[flown.t == 0.0]
-    for signal, course, read in zip(plant.states, drawn.unbind(-1), starts.unbind(-1), strict=True):
-        if len(starts) and _outside(course, read):
+    for k, signal in enumerate(plant.states):
+        if len(starts) and _outside(drawn[:, k], starts[:, k]):
             yield (
-                f"state {signal.name} is read between {read.min():.4g} and {read.max():.4g} {signal.unit} at the "
-                f"start, where draw_initial_state of the plant draws {course.min():.4g} to {course.max():.4g}: a wrong "
-                "zero, or other starts than those that plans are made for"
+                f"state {signal.name} is read at the start {_beside(signal, starts[:, k], drawn[:, k])}: a wrong zero, "
+                "or other starts than those that plans are made for"
             )
+
+
+def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
+    """Which inputs are read far outside what the plant draws, or at a small share of it."""
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
+    for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
+        if _outside(course, read) or BEYOND * read.abs().max() < course.abs().min():
+            yield f"input {signal.name} is read {_beside(signal, read, course)}"
+
+
+def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
+    """Readings beside draws in words."""
+    return (
+        f"between {read.min():.4g} and {read.max():.4g} {signal.unit}, where the plant draws {drawn.min():.4g} to "
+        f"{drawn.max():.4g}"
+    )
 
 
 def _outside(course: Tensor, read: Tensor) -> bool:
@@ -265,20 +280,6 @@ def _outside(course: Tensor, read: Tensor) -> bool:
     low, high = course.min().item(), course.max().item()
     width = high - low or max(abs(low), abs(high))
     return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > (BEYOND - 1.0) * width
-
-
-def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which inputs are read far outside what the plant draws, or at a small share of it."""
-    if not plant.inputs:
-        return
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
-    for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
-        low, high = course.min().item(), course.max().item()
-        if _outside(course, read) or BEYOND * read.abs().max() < course.abs().min():
-            yield (
-                f"input {signal.name} is read between {read.min():.4g} and {read.max():.4g} {signal.unit}, where "
-                f"draw_exogenous of the plant draws {low:.4g} to {high:.4g}"
-            )
 
 
 def _better(present: Suspicion, fit: "_Fit", flown: Flown, mistakes: list[tuple[str, Flown]]) -> list[Suspicion]:
@@ -432,17 +433,10 @@ class _Fit:
 
 def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
     """Flights as they would be with each mistake mended, and the mistake in words."""
-    yield from _signal_mistakes("state", plant.states, flown, ("states", "ends"))
-    yield from _signal_mistakes("action", plant.actions, flown, ("actions",))
-    yield from _signal_mistakes("input", plant.inputs, flown, ("exogenous",))
-    for unit in dict.fromkeys(signal.unit for signal in plant.states):
-        alike = [k for k, signal in enumerate(plant.states) if signal.unit == unit]
-        together = [("of the other sign", -1.0, 0.0), *_units(unit, FACTORS)]
-        for words, scale, offset in together if len(alike) > 1 else ():
-            changed = flown
-            for k in alike:
-                changed = _changed(changed, ("states", "ends"), k, scale, offset)
-            yield f"all states in {unit} are {words}", changed
+    states, actions, inputs = plant.states, plant.actions, plant.inputs
+    yield from _signal_mistakes("state", states, flown, ("states", "ends"), FACTORS, [s.unit for s in states])
+    yield from _signal_mistakes("action", actions, flown, ("actions",), (), [""] * len(actions))
+    yield from _signal_mistakes("input", inputs, flown, ("exogenous",), FACTORS, [s.name for s in inputs])
     for signal, signs in zip(plant.states, 1.0 - 2.0 * torch.eye(len(plant.states)).double(), strict=True):
         yield f"the equation of state {signal.name} has the other sign", flown._replace(signs=signs)
     for ratio in RATIOS:
@@ -452,24 +446,35 @@ def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
         yield "an input is read one interval late", flown._replace(exogenous=flown.earlier_exogenous)
     for k, signal in enumerate(plant.actions):
         if signal.low != -signal.high:
-            mirrored = _changed(flown, ("actions",), k, -1.0, signal.low + signal.high)
+            mirrored = _changed(flown, ("actions",), [k], -1.0, signal.low + signal.high)
             yield f"action {signal.name} runs from the other end of its range", mirrored
         levels = LEVELS if LASTING * plant.n_steps <= CORRELATION else 0
         for level in torch.linspace(signal.low, signal.high, levels).tolist():
-            constant = _changed(flown, ("actions",), k, 0.0, level)
+            constant = _changed(flown, ("actions",), [k], 0.0, level)
             yield f"action {signal.name} does not arrive, a constant one fits", constant
 
 
 def _signal_mistakes(
-    what: str, signals: Sequence[Signal], flown: Flown, names: tuple[str, ...]
+    what: str,
+    signals: Sequence[Signal],
+    flown: Flown,
+    names: tuple[str, ...],
+    factors: Sequence[float],
+    kinds: Sequence[str],
 ) -> Iterator[tuple[str, Flown]]:
-    """The signs, units and orders of one kind of signals, whose values the flights hold under the names."""
-    if what == "action" and len(signals) > 1:
-        yield "all actions have the other sign", flown._replace(actions=-flown.actions)
-    for k, signal in enumerate(signals):
-        yield f"{what} {signal.name} has the other sign", _changed(flown, names, k, -1.0, 0.0)
-        for words, scale, offset in _units(signal.unit, () if what == "action" else FACTORS):
-            yield f"{what} {signal.name} is {words}", _changed(flown, names, k, scale, offset)
+    """The signs, units and orders of signals, whose values the flights hold under the names; those of a kind together.
+
+    Signals of a kind may have one mistake together; the unit of an empty kind is none.
+    """
+    groups = [(f"{what} {signal.name}", "has", "is", signal.unit, [k]) for k, signal in enumerate(signals)]
+    for kind in dict.fromkeys(kinds):
+        columns = [k for k, other in enumerate(kinds) if other == kind]
+        if len(columns) > 1:
+            groups.append((f"all {what}s{f' in {kind}' if kind else ''}", "have", "are", kind, columns))
+    for subject, has, are, unit, columns in groups:
+        yield f"{subject} {has} the other sign", _changed(flown, names, columns, -1.0, 0.0)
+        for words, scale, offset in _units(unit, factors):
+            yield f"{subject} {are} {words}", _changed(flown, names, columns, scale, offset)
     for k, m in itertools.combinations(range(len(signals)), 2):
         order = list(range(len(signals)))
         order[k], order[m] = m, k
@@ -487,9 +492,9 @@ def _units(unit: str, factors: Sequence[float]) -> Iterator[tuple[str, float, fl
             yield f"read {1.0 / factor:g} times as large as it is", factor, 0.0
 
 
-def _changed(flown: Flown, names: tuple[str, ...], column: int, scale: float, offset: float) -> Flown:
-    """The flights with one column changed to offset + scale·values."""
+def _changed(flown: Flown, names: tuple[str, ...], columns: list[int], scale: float, offset: float) -> Flown:
+    """The flights with some columns changed to offset + scale·values."""
     changed = {name: getattr(flown, name).clone() for name in names}
     for values in changed.values():
-        values[:, column] = offset + scale * values[:, column]
+        values[:, columns] = offset + scale * values[:, columns]
     return flown._replace(**changed)

@@ -4,10 +4,9 @@ import asyncio
 import concurrent.futures
 import contextlib
 import math
+import struct
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
-
-import torch
 
 from rt_torchrl.systems.machine.connected_plant import (
     LateAnswerError,
@@ -19,12 +18,14 @@ from rt_torchrl.systems.machine.connected_plant import (
 Result = TypeVar("Result")
 CONNECT = 4.0
 """Longest time of an attempt to connect [s]."""
-WHOLE = {
-    f"{sign}Int{bits}": (0 if sign else -(2 ** (bits - 1)), 2 ** (bits - (not sign)) - 1)
-    for sign in ("", "U")
-    for bits in (16, 32, 64)
-} | {"SByte": (-(2**7), 2**7 - 1), "Byte": (0, 2**8 - 1)}
-"""Least and greatest number of each type of whole numbers."""
+FORMATS = dict(
+    zip(
+        ("SByte", "Byte", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Float", "Double"),
+        "bBhHiIqQfd",
+        strict=True,
+    )
+)
+"""Formats of ``struct`` of the types of numbers."""
 PASSING = frozenset(
     {
         *("BadNoCommunication", "BadCommunicationError", "BadNotConnected", "BadServerNotConnected", "BadTimeout"),
@@ -110,7 +111,7 @@ class OpcUaLink:
             return ua.VariantType.Double
         if kind == ua.VariantType.Variant:  # any number
             return ua.VariantType.Double
-        if kind.name not in ("Double", "Float", *WHOLE):
+        if kind.name not in FORMATS:
             raise RefusedRequestError(
                 f"{where}: it holds {kind.name}, and a command is a number; give the machine a node of a numeric type, "
                 "such as Double."
@@ -123,18 +124,17 @@ class OpcUaLink:
         Raises:
             RefusedRequestError: if it does not fit the type.
         """
-        kind = self._types[tag]
-        where = f"{self.url}: {tag!r} = {value:g} does not fit node {self._written[tag]!r} of type {kind.name}"
-        if kind.name in WHOLE:
-            low, high = WHOLE[kind.name]
-            if not (math.isfinite(value) and value == round(value) and low <= value <= high):
-                raise RefusedRequestError(
-                    f"{where}, which takes whole numbers from {low} to {high}; give the machine a node of type Double."
-                )
-            return self._ua.Variant(round(value), kind)
-        if kind.name == "Float" and math.isfinite(value) and abs(value) > torch.finfo(torch.float32).max:
-            raise RefusedRequestError(f"{where}.")
-        return self._ua.Variant(float(value), kind)
+        kind, number = self._types[tag], value
+        try:
+            if kind.name not in ("Double", "Float"):
+                number = round(value)
+                if number != value:
+                    raise ValueError("it takes whole numbers; give the machine a node of type Double")
+            struct.pack(f"<{FORMATS[kind.name]}", number)
+        except (ValueError, OverflowError, struct.error) as error:
+            node = f"node {self._written[tag]!r} of type {kind.name}"
+            raise RefusedRequestError(f"{self.url}: {tag!r} = {value:g} does not fit {node}: {error}.") from error
+        return self._ua.Variant(number, kind)
 
     def read(self) -> dict[str, float]:
         rows = self._within(self._connected().read_attributes(self._sources), self.timeout)
