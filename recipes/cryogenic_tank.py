@@ -114,7 +114,7 @@ class Config(RunConfig):
             twinning.assimilation.initial is estimated.
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
         unknown: what the real system has beside its twin, one or more of bias_5, bias_15, bias_minus_15, drift_10,
-            drift_25 (of the pressure sensor), valve_lag, two_zones and all; docs/unknown_systems.md describes them.
+            drift_25 (of the pressure sensor), valve_lag and all; docs/unknown_systems.md describes them.
     """
 
     policy: Literal["paper", "mlp"] = "paper"

@@ -124,7 +124,7 @@ class Config(RunConfig):
         peak: height of the window of J_a around the target: unit, or printed as in the paper.
         model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
         unknown: what the real system has beside its twin, one or more of plane_4.4, plane_6.3, plane_12.6 (slow stroke
-            planes), delay, sag, gust, lift_lag, all_1 and all_2; docs/unknown_systems.md describes them.
+            planes), delay, sag, all_1 and all_2; docs/unknown_systems.md describes them.
     """
 
     policy: Literal["mlp", "paper"] = "mlp"

@@ -11,13 +11,13 @@ from .plants.actuators import (
     StickingActuator,
 )
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
-from .plants.vector_field import LaggedCoefficients, ScaledCoefficients
+from .plants.vector_field import ScaledCoefficients
 from .plants.extension import ExtendedClosure, Extension
 from .plants.vector_field import NeuralResidual
 from .plants.plant import Plant, Transition
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.sampling import require_request, require_stable_step, rk4_step
-from .plants.sensors import BiasedSensor, UnreadInput
+from .plants.sensors import BiasedSensor
 from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .plants.sensors import StackedObservations
 from .contract import ContractReport, PlantContractError, check_plant
@@ -128,7 +128,6 @@ __all__ = [
     "Held",
     "HypothesesConfig",
     "LaggedActuator",
-    "LaggedCoefficients",
     "Learner",
     "LearnerConfig",
     "LearningMethod",
@@ -196,7 +195,6 @@ __all__ = [
     "TwinEnsemble",
     "TwinningConfig",
     "Uncertainty",
-    "UnreadInput",
     "WholeEpisodes",
     "Wiring",
     "WiringError",

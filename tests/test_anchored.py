@@ -15,8 +15,9 @@ from rt_torchrl.envs.flapping_wing.unknown import unknown as drone
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
 from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.plants.plant import Transition
-from rt_torchrl.plants.sensors import UnreadInput
+from rt_torchrl.plants.extension import Extension
+from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
 from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -90,17 +91,27 @@ def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
     assert torch.equal(replays.flown[0], replays.actions(policy)) and replays.explored.tolist() == [0.0, 0.0]
 
 
-def test_the_vector_field_of_an_anchored_plant_is_that_of_the_plant():
-    plant, (t, state, action, inputs) = LinearQuadratic(), torch.rand(4, 3, 2, dtype=torch.float64)
-    t, action, z = t[:, 0], action[:, :1], inputs[:, :1]
-    found = Anchored(plant).vector_field(t, state, action, torch.cat([z, inputs], -1), plant.closure)
-    assert torch.equal(found, plant.vector_field(t, state, action, z, plant.closure))
+class Pushed(Extension):
+    """A plant on which more acts than its sensor reads, cos t."""
+
+    advance = Plant.advance
+
+    def __init__(self, base):
+        super().__init__(base, [Signal(symbol=part, name=f"unread_{part}", unit="N") for part in "pq"])
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        base, hidden = self.split(state)
+        field = self.base.vector_field(t, base, action, exogenous + hidden[..., :1], closure)
+        return torch.cat([field, -hidden[..., 1:], hidden[..., :1]], -1)
+
+    def rest(self, base):
+        return torch.tensor([1.0, 0.0], dtype=base.dtype).expand(*base.shape[:-1], 2)
 
 
 def pushed(horizon=5.0):
     """A linear plant on which more acts than its sensor reads, and the plant that its twin knows."""
     physics = LinearQuadratic(horizon=horizon)
-    return UnreadInput(physics, "disturbance", 1.0, (0.7, 1.9)), physics
+    return Pushed(physics), physics
 
 
 def test_an_unread_force_on_a_linear_plant_is_replayed_exactly_under_any_policy():

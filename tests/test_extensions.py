@@ -23,9 +23,9 @@ from rt_torchrl.plants.actuators import (
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.extension import ExtendedClosure, Extension
 from rt_torchrl.plants.plant import PARTS, Plant
-from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations, UnreadInput
+from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.plants.vector_field import LaggedCoefficients, NeuralResidual, ScaledCoefficients
+from rt_torchrl.plants.vector_field import NeuralResidual, ScaledCoefficients
 from rt_torchrl.trajectories.rollout import Rollout
 
 DT = 0.1
@@ -49,10 +49,8 @@ EXTENSIONS = {
     "rate": lambda base: RateLimitedActuator(base, "force", 0.5),
     "play": lambda base: PlayActuator(base, "force", 0.02),
     "stiction": lambda base: StickingActuator(base, "force", 0.02),
-    "inflow": lambda base: LaggedCoefficients(base, 0.5, (0.1, -0.2)),
     "share": lambda base: ScaledCoefficients(base, 0.9),
     "bias": lambda base: BiasedSensor(base, "position", 0.3, 0.02, scale=0.1),
-    "unread": lambda base: UnreadInput(base, "disturbance", 0.5, [2.0]),
     "residual": residual,
     "stacked": lambda base: StackedObservations(base, 2),
     "delayed resonance": lambda base: DelayedActuator(ResonantActuator(base, "force", 3.0, 0.4), "force", 0.2),
@@ -138,20 +136,6 @@ def test_a_coefficient_stays_within_its_factor_whatever_the_weight():
     for weight, expected in ((0.0, 2.0), (0.5, 2.0 * 10.0 ** math.tanh(0.5)), (50.0, 20.0), (-50.0, 0.2)):
         own.weights.data.fill_(weight)
         assert own.named_coefficients()["lag"].item() == pytest.approx(expected)
-
-
-def test_the_inflow_of_a_constant_force_rises_exponentially():
-    plant = EXTENSIONS["inflow"](LinearQuadratic())
-
-    class Constant(nn.Module):
-        def forward(self, features):
-            return torch.ones_like(features)
-
-    state, exogenous, command = flight(plant)
-    closure = plant.extended(Constant())
-    hidden = Rollout(plant, closure)(state, exogenous, command).states[0, :, 2]
-    t = DT * torch.arange(41, dtype=torch.float64)
-    torch.testing.assert_close(hidden, 1.0 + (0.1 - 1.0) * torch.exp(-t / 0.5), rtol=1e-12, atol=1e-12)
 
 
 def test_a_biased_sensor_changes_what_is_read_and_not_what_happens():

@@ -4,20 +4,16 @@ import math
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
 from test_export_recipe import RECIPES, leave_run
-from test_extensions import DT, flight
 
 from rt_torchrl import check_plant, load_run
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.unknown import TwoZones
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
-from rt_torchrl.plants.sensors import UnreadInput
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -50,21 +46,6 @@ def test_every_system_fulfils_the_contract_and_reads_what_its_twin_knows(plant, 
     assert set(systems.SYSTEMS[name]) <= set(systems.PARTS)
 
 
-def test_an_unread_input_is_a_sum_of_harmonics_with_its_deviation():
-    base = LinearQuadratic()
-    plant = UnreadInput(base, "disturbance", 0.5, (0.7, 3.0))
-    state, exogenous, command = flight(plant)
-    t = DT * torch.arange(command.shape[1], dtype=torch.float64)
-    p, q = state[:, 2:4, None], state[:, 4:, None]
-    turn = torch.tensor([[0.7], [3.0]], dtype=torch.float64) * t
-    unread = (p * turn.cos() - q * turn.sin()).sum(1)
-    expected = flown(base, state[:, :2], exogenous + unread.unsqueeze(-1), command)
-    torch.testing.assert_close(flown(plant, state, exogenous, command)[..., :2], expected, rtol=1e-10, atol=1e-10)
-    drawn = plant.draw_initial_state(20_000, torch.Generator().manual_seed(0))[:, 2:4].sum(-1)
-    assert drawn.std().item() == pytest.approx(0.5, rel=0.02)
-    assert not plant.at_rest(state[:, :2])[:, 2:].any()
-
-
 def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     base = WindTurbine(inertia=1e15, observe=("scheduled",))
     plant = LaggedInflow(base, 10.0)
@@ -90,27 +71,6 @@ def test_a_rotor_turns_in_the_wind_and_its_filter_in_what_the_anemometer_reads()
     found, expected = flown(plant, state, read, command), flown(base, true, wind, command)
     torch.testing.assert_close(found[..., :2], expected[..., :2], rtol=1e-12, atol=0.0)
     torch.testing.assert_close(found[..., 2], 0.9 * expected[..., 2], rtol=1e-12, atol=0.0)
-
-
-def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixes():
-    base = CryogenicTank(horizon=30_000.0)
-    plant, n = TwoZones(base, 2.0, 5 * 3600.0), 1000
-    generator = torch.Generator().manual_seed(0)
-    state = plant.draw_initial_state(1, generator)
-    exogenous, command = plant.draw_exogenous(1, generator), torch.zeros(1, n, 1, dtype=torch.float64)
-    stirred = flown(base, state[:, :3], exogenous, command)[0]
-    found = flown(plant, state, exogenous, command)[0]
-    torch.testing.assert_close(found[:, :2], stirred[:, :2], rtol=1e-12, atol=0.0)
-    # The convolution of the stirred pressure with the kernel of the mixing, by the rule of the midpoint.
-    age = base.dt * (torch.arange(n, dtype=torch.float64).flip(0) + 0.5)
-    middle = 0.5 * (stirred[1:, 2] + stirred[:-1, 2])
-    kernel = torch.exp(-age / plant.mixing_time) * base.dt / plant.mixing_time
-    mixed = (kernel * middle).sum() + state[0, 2] * math.exp(-n * base.dt / plant.mixing_time)
-    surface = stirred[-1, 2] + (stirred[-1, 2] - mixed)
-    assert found[-1, 2].item() == pytest.approx(surface.item(), abs=1.0)
-    assert surface - stirred[-1, 2] > 1e3
-    first = (found[1:3, 2] - found[:2, 2]) / (stirred[1:3, 2] - stirred[:2, 2])
-    torch.testing.assert_close(first, torch.full_like(first, 2.0), rtol=5e-3, atol=0.0)
 
 
 def test_several_systems_combine_in_the_order_of_their_parts():

@@ -181,7 +181,7 @@ class Timed(LinearQuadratic):
 
 
 EXTENSIONS = {"none": lambda base: base} | {
-    name: extensions.EXTENSIONS[name] for name in ("lag", "delay", "bias", "unread", "residual")
+    name: extensions.EXTENSIONS[name] for name in ("lag", "delay", "bias", "residual")
 }
 
 

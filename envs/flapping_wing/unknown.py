@@ -15,8 +15,7 @@ from rt_torchrl.plants.actuators import (
 )
 from rt_torchrl.plants.extension import System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.sensors import UnreadInput
-from rt_torchrl.plants.vector_field import LaggedCoefficients, NeuralResidual
+from rt_torchrl.plants.vector_field import NeuralResidual
 
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 STAGES = 12
@@ -65,26 +64,7 @@ def sagging(plant: Plant) -> Plant:
     return ScaledActuator(plant, AMPLITUDE, 0.95)
 
 
-def gusty(plant: Plant) -> Plant:
-    """Gusts that the wind sensor on the ground does not read.
-
-    Deviation 0.5 m/s: engineering guess, half that of the wind that is read. Frequencies 0.9, 2.1 and 4.7 rad/s:
-    engineering guess, faster than the wind that is read (3 s) and slower than the wing beat.
-    """
-    return UnreadInput(plant, "headwind", 0.5, (0.9, 2.1, 4.7))
-
-
-def lifting_late(plant: Plant) -> Plant:
-    """Blade elements whose lift and drag follow the flow with a lag, as after Wagner.
-
-    Time constant 2 ms: two to three half chords of 5 mm at the 6 m/s of a wing's middle, the time in which Wagner's
-    function makes up half of what is missing.
-    """
-    elements = plant.get_buffer("radius").shape
-    return LaggedCoefficients(plant, 2e-3, (0.0, 0.0) * elements.numel(), elements=tuple(elements))
-
-
-PARTS = ("wings", "wind", "supply", "stroke plane", "drives", "link")
+PARTS = ("supply", "stroke plane", "drives", "link")
 """Parts of the drone, in the order in which they are changed: what is next to the body comes first."""
 SYSTEMS: Mapping[str, System] = {
     "plane_4.4": {"stroke plane": partial(tilting, frequency=4.4, damping=0.3)},
@@ -92,20 +72,16 @@ SYSTEMS: Mapping[str, System] = {
     "plane_12.6": {"stroke plane": partial(tilting, frequency=12.6, damping=0.4)},
     "delay": {"link": partial(late, delay=0.2)},
     "sag": {"supply": sagging},
-    "gust": {"wind": gusty},
     "plane_rate": {"stroke plane": partial(RateLimitedActuator, action=PLANE, size=60.0)},
     "amplitude_play": {"supply": partial(PlayActuator, action=AMPLITUDE, size=3.0)},
     "plane_play": {"stroke plane": partial(PlayActuator, action=PLANE, size=4.0)},
-    "lift_lag": {"wings": lifting_late},
     "all_1": {
-        "wind": gusty,
         "supply": sagging,
         "stroke plane": partial(tilting, frequency=9.4, damping=0.4),
         "drives": partial(lagging, amplitude=0.1, plane=0.05),
         "link": partial(late, delay=0.1),
     },
     "all_2": {
-        "wind": gusty,
         "supply": sagging,
         "stroke plane": partial(tilting, frequency=6.3, damping=0.3),
         "drives": partial(lagging, amplitude=0.15),

@@ -119,10 +119,6 @@ class Extension(Plant):
         """The action that acts at the start of an interval, by which its cost is judged; by default the applied one."""
         return applied
 
-    def meeting(self, hidden: Hidden, exogenous: Input) -> Input:
-        """The inputs that act on the plant in an interval; by default those that sensors read."""
-        return exogenous
-
     def true_state(self, state: State) -> Float[Tensor, "*batch n_b"]:
         """The states of the plant, by which cost, end and merit are judged; by default those that sensors read."""
         return self.split(state)[0]
@@ -167,16 +163,14 @@ class Extension(Plant):
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, hidden = self.split(state)
-        acting, met = self.acting(hidden, action), self.meeting(hidden, exogenous)
-        field = self.base.vector_field(t, base, acting, met, self.law(closure))
+        field = self.base.vector_field(t, base, self.acting(hidden, action), exogenous, self.law(closure))
         return self.joined(field, self.rates(hidden, action, closure))
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """The plant's own scheme under the mean of the action that acts on it in this interval."""
         base, hidden = self.split(state)
         acting, end = self.respond(hidden, applied, closure)
-        met = self.meeting(hidden, exogenous)
-        return self.joined(self.base.advance(t, base, acting, met, self.law(closure)), end)
+        return self.joined(self.base.advance(t, base, acting, exogenous, self.law(closure)), end)
 
     @property
     def discrepancy_scales(self) -> tuple[float, ...]:

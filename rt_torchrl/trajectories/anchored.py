@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
-from rt_torchrl.plants.shapes import Action, Costs, Hidden, Input, Inputs, Starts, State, Time
+from rt_torchrl.plants.shapes import Action, Costs, Input, Inputs, Starts, State, Time
 from rt_torchrl.plants.signal import Signal, bounds, differences
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -50,10 +50,6 @@ class Anchored(Extension):
         self.count = len(base.inputs)
         increments = [Signal(symbol="e", name=f"increment_{signal.name}", unit=signal.unit) for signal in base.readings]
         self.inputs = (*base.inputs, *increments)
-
-    def meeting(self, hidden: Hidden, exogenous: Input) -> Input:
-        """The inputs of the plant."""
-        return exogenous[..., : self.count]
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
         met, increments = exogenous[..., : self.count], exogenous[..., self.count :]
