@@ -1,6 +1,6 @@
 """The table of results to hold: default trainings, unknown systems, and an identification, over several seeds.
 
-``uv run --extra tank tests/ruler.py --seeds 5 --folder runs/ruler`` trains what is missing in the folder, two
+``uv run tests/ruler.py --seeds 5 --folder runs/ruler`` trains what is missing in the folder, two
 trainings side by side on one thread each, and prints the table as Markdown. The same command goes on where it was
 interrupted; another folder is another measurement. It takes about 40 minutes on two cores.
 """

@@ -92,7 +92,7 @@ def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
 
 
 class Pushed(Extension):
-    """A plant on which more acts than its sensor reads, cos t."""
+    """A plant on which more acts than its sensor reads, a wave with a random amplitude and phase."""
 
     advance = Plant.advance
 
@@ -105,7 +105,11 @@ class Pushed(Extension):
         return torch.cat([field, -hidden[..., 1:], hidden[..., :1]], -1)
 
     def rest(self, base):
-        return torch.tensor([1.0, 0.0], dtype=base.dtype).expand(*base.shape[:-1], 2)
+        return torch.zeros_like(base)
+
+    def draw_initial_state(self, batch, generator):
+        base = self.base.draw_initial_state(batch, generator)
+        return torch.cat([base, torch.randn(batch, 2, generator=generator, dtype=torch.float64)], -1)
 
 
 def pushed(horizon=5.0):

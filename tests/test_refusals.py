@@ -33,7 +33,7 @@ from rt_torchrl.trajectories.rollout import Rollout
 MODULES = """
     control.command_cost control.forecasts control.predictive_control evaluation.optimum
     envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
-    envs.cryogenic_tank.saturation envs.cryogenic_tank.unknown envs.flapping_wing.closures
+    envs.cryogenic_tank.unknown envs.flapping_wing.closures
     envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real
     envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
     envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log

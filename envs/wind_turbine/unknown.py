@@ -44,7 +44,6 @@ class LaggedInflow(Extension):
 
     This is the crudest model of dynamic inflow: the wake takes the time D/u to change. The torque begins with the
     quasi-steady one of the true rotor, the power, which a twin identifies, with a usual C_p, both in the filtered wind.
-    ``LaggedCoefficients`` would let C_p lag alone, while the torque follows u² at once.
 
     Args:
         base: the turbine.

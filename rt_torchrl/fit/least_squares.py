@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
-from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import AtLeastOne, Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
@@ -65,52 +64,42 @@ class Minimum(NamedTuple):
     segment: int = 0
 
 
-F = TypeVar("F", bound=Descended | Minimum)
 R = TypeVar("R")
 
 
-def multi_start(
-    closure: nn.Module, count: int, descend: Callable[[int], F], *, first: dict[str, Tensor] | None = None
-) -> list[F]:
+def multi_start(closure: nn.Module, starts: int, descend: Callable[[int], Minimum]) -> Minimum:
     """Descend from several first weights; the best weights stay.
 
-    The first descent begins with the present weights, the second with ``first`` if these are given. The others begin
-    with the first weights and with the best ones so far in turns, moved at random: the best may have run to where
-    nothing shows them.
+    The first two descents begin with the present weights. The others begin with these and with the best ones so far in
+    turns, moved at random: the best may have run to where nothing shows them.
 
     Args:
         closure: closure with the weights.
-        count: number of descents.
+        starts: number of first weights.
         descend: function of the number of the descent, which moves the weights and returns the result.
-        first: other first weights; by default the present ones.
 
     Returns:
-        The results of all descents that have not diverged, beginning with that from the present weights.
+        The least minimum, with the trial steps of all descents that have not diverged.
 
     Raises:
-        FloatingPointError: if the descent from the present weights diverges.
+        FloatingPointError: if the first descent diverges.
     """
-    generator = torch.Generator().manual_seed(0)
-    origin = copy.deepcopy(closure.state_dict()) if first is None else first
-    results = [descend(0)]
-    least, best = results[0].best, copy.deepcopy(closure.state_dict())
-    for number in range(1, count):
-        closure.load_state_dict(origin if number % 2 else best)
-        if number > 1 or first is None:
+    generator, origin = torch.Generator().manual_seed(0), copy.deepcopy(closure.state_dict())
+    least, best = descend(0), copy.deepcopy(closure.state_dict())
+    iterations = least.iterations
+    for number in range(1, 1 + starts):
+        closure.load_state_dict(best if number > 1 and number % 2 else origin)
+        if number > 1:
             move(closure, generator)
         try:
-            results.append(descend(number))
+            found = descend(number)
         except FloatingPointError:  # weights drawn at random may be nonsense
             continue
-        if results[-1].best < least:
-            least, best = results[-1].best, copy.deepcopy(closure.state_dict())
+        iterations += found.iterations
+        if found.best < least.best:
+            least, best = found, copy.deepcopy(closure.state_dict())
     closure.load_state_dict(best)
-    return results
-
-
-def best_of(tried: Sequence[Minimum]) -> Minimum:
-    """The least minimum, with the trial steps of all."""
-    return min(tried, key=lambda minimum: minimum.best)._replace(iterations=sum(one.iterations for one in tried))
+    return least._replace(iterations=iterations)
 
 
 def over_segments(
@@ -328,7 +317,13 @@ class Estimation:
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
         prior = WeightPrior(closure, config.prior)
-        minimum = best_of(multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number)))
+
+        def descend(number: int) -> Minimum:
+            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if number else 0
+            minimum = self._descended(self.likelihood(records, prior=prior))
+            return minimum._replace(iterations=done + minimum.iterations)
+
+        minimum = multi_start(closure, config.starts, descend)
         iterations = minimum.iterations
         for _ in range(config.rounds):
             rest = self._follow_residuals(minimum.likelihood)
@@ -409,19 +404,6 @@ class Estimation:
         method = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
         method.run(likelihood.normal_equations, INITIAL_ITERATIONS)
         return likelihood
-
-    def _both_ways(self, records: Sequence[SensorRecord], prior: WeightPrior, number: int) -> Minimum:
-        """The minimum under the first noise levels by the better way; weights moved at random go the second one."""
-        closure = self.twin.closure
-
-        def descend(staged: int) -> Minimum:
-            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if staged else 0
-            minimum = self._descended(self.likelihood(records, prior=prior))
-            return minimum._replace(iterations=done + minimum.iterations)
-
-        if number:
-            return descend(1)
-        return best_of(multi_start(closure, 2, descend, first=copy.deepcopy(closure.state_dict())))
 
     def _descended(self, likelihood: Likelihood) -> Minimum:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
