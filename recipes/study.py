@@ -33,7 +33,7 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.compare import FinishedRun, Row, markdown, with_interval
 from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of, worn_closure
 from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings, settings_of, task_of
-from rt_torchrl.steps.config import Arm, Role
+from rt_torchrl.steps.config import Arm
 
 PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
 ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
@@ -86,25 +86,23 @@ class Config:
 
     def systems_by_name(self) -> dict[str, tuple[Path, list[str]]]:
         """Recipe and options of each system."""
-        systems = {}
+        systems = []
         for text in self.systems or (PLANTS[:1] if self.quick else PLANTS):
             name, words = named(text)
             if not words:
                 raise ValueError(f"systems: {text!r} names no recipe; write RECIPE OPTIONS or NAME=RECIPE OPTIONS.")
             recipe = Path(words[0]) if words[0].endswith(".py") else Path(__file__).with_name(f"{words[0]}.py")
             usual = re.sub(r"[^\w.+-]+", "-", "-".join(word.lstrip("-") for word in (recipe.stem, *words[1:])))
-            add("systems", systems, name or usual, (recipe, words[1:]))
-        return systems
+            systems.append((name or usual, (recipe, words[1:])))
+        return by_name("systems", systems)
 
     def arms_by_name(self) -> dict[str, list[str]]:
         """Options of each arm."""
-        arms: dict[str, list[str]] = {}
-        for text in self.arms:
-            name, words = (text, ["--twinning.arm", text]) if text in ARMS else named(text)
+        arms = [(text, ["--twinning.arm", text]) if text in ARMS else named(text) for text in self.arms]
+        for text, (name, _) in zip(self.arms, arms, strict=True):
             if name is None:
                 raise ValueError(f"arms: {text!r} has no name; write NAME=OPTIONS, or one of {', '.join(ARMS)}.")
-            add("arms", arms, name, words)
-        return arms
+        return by_name("arms", arms)
 
     def trainings(self) -> "dict[tuple[str, str], list[Training]]":
         """The trainings by system and arm, over the seeds.
@@ -140,11 +138,13 @@ def named(text: str) -> tuple[str | None, list[str]]:
     return (name[1], shlex.split(text[name.end() :])) if name else (None, shlex.split(text))
 
 
-def add(argument: str, known: dict[str, Any], name: str, value: Any) -> None:
-    """Add what has a name of its own."""
-    if name in known:
-        raise ValueError(f"{argument}: {name!r} stands for two; give names, as in NAME=OPTIONS.")
-    known[name] = value
+def by_name(argument: str, entries: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
+    """Entries by their names, each of which has to be its own."""
+    names = [name for name, _ in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{argument}: {name!r} stands for two; give names, as in NAME=OPTIONS.")
+    return dict(entries)
 
 
 @functools.cache
@@ -421,7 +421,9 @@ def comparisons_of(
         if finished[key] and (kept := search.kept()):
             path, asked = search.path, trainings[key][0].asked()
             sought = math.inf if kept["J_a"] is None else kept["J_a"]
-            of_class = (run.cost for run in finished[key] if of_the_class(run.live, asked))
+            # Model predictive control in the place of the model-based policy is of another class.
+            plans = asked.twinning.planner.method == "receding_horizon"
+            of_class = (run.cost for run in finished[key] if run.live == "model_free" or not plans)
             least[path] = min([least.get(path, sought), *of_class])
     rows: dict[str, list[Row]] = {}
     for (system, arm), runs in finished.items():
@@ -430,11 +432,6 @@ def comparisons_of(
             optimum = None if search is None else least.get(search.path)
             rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum))
     return [Comparison(system, of_system) for system, of_system in rows.items()]
-
-
-def of_the_class(role: Role, config: RunConfig) -> bool:
-    """Whether the policy of a role is of the class that ``config.policy`` names."""
-    return role == "model_free" or config.twinning.planner.method != "receding_horizon"
 
 
 def main(config: Config) -> None:

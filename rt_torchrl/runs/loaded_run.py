@@ -243,7 +243,10 @@ def load_run(
     weights = _read_weights(folder)
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant
-    policies, closure = _parts(config, physics)
+    generator = torch.Generator().manual_seed(config.seed)
+    policies = config.make_policies(physics, generator)
+    closure = config.make_closure(physics, generator)
+    policies = config.acting_policies(policies, physics, closure)
     initial = copy.deepcopy(closure)
     for role, part in {**policies, "closure": closure}.items():
         try:
@@ -256,7 +259,7 @@ def load_run(
         plant=plant,
         physics=physics,
         closure=closure,
-        policies=policies,
+        policies=dict(policies.items()),
         initial_closure=initial,
         folder=folder,
     )
@@ -310,14 +313,6 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
     if isinstance(recipe, type):
         return require_config(recipe, recipe.__qualname__)
     return load_recipe(Path(recipe)).Config
-
-
-def _parts(config: RunConfig, physics: Plant) -> tuple[dict[str, nn.Module], nn.Module]:
-    """Policies and closure of a run before their training."""
-    generator = torch.Generator().manual_seed(config.seed)
-    policies = config.make_policies(physics, generator)
-    closure = config.make_closure(physics, generator)
-    return dict(config.acting_policies(policies, physics, closure).items()), closure
 
 
 def _read_weights(folder: Path) -> dict[str, dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
@@ -204,37 +204,24 @@ def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | N
 
 def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
     """Wall time of each step over all episodes [s]."""
-    total: dict[str, float] = {}
+    total = Counter[str]()
     for record in episodes:
-        for step, seconds in record["seconds"].items():
-            total[step] = total.get(step, 0.0) + seconds
-    return total
+        total.update(record["seconds"])
+    return dict(total)
 
 
-def reference_entry(
-    config: RunConfig,
-    unseen: UnseenEpisodes,
-    make_policy: Callable[[torch.Generator], nn.Module],
-    better: Costs,
-) -> dict[str, Any]:
-    """The entry ``reference`` of the summary; nothing without the option ``reference``.
+def reference_of(
+    unseen: UnseenEpisodes, make_policy: Callable[[torch.Generator], nn.Module], better: float
+) -> dict[str, float]:
+    """The entry ``reference`` of the summary: what exact gradients on the true plant reach.
 
     Args:
-        config: options of the run.
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
-        better: J_a of the better policy of the training on these episodes.
+        better: mean J_a of the better policy of the training on these episodes.
     """
-    if not config.reference:
-        return {}
-    optimum = exact_optimum(unseen, make_policy)
-    return {
-        "reference": {
-            "J_a": optimum.cost,
-            "J_a_by_gradients": optimum.by_gradients,
-            "better_over_reference": better.mean().item() / optimum.cost,
-        }
-    }
+    best = exact_optimum(unseen, make_policy)
+    return {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "better_over_reference": better / best.cost}
 
 
 MOST_WEIGHTS = 12

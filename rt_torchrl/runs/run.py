@@ -139,8 +139,8 @@ class Run:
             if real is None:
                 make_env = functools.partial(simulated, plant, config, first, device=device)
             system = real or simulated(plant, config, first, device=device)
-            makers = (learner or functools.partial(ActorCritic, replay=replay), planner, referee, collector)
-            self._make_algorithm(system, make_env, physics, *makers, device=device)
+            make_learner = learner or functools.partial(ActorCritic, replay=replay)
+            self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector, device=device)
             self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device)
             self._real, self._device = real, device
             made = {name: law(physics) for name, law in laws.items()}
@@ -162,14 +162,12 @@ class Run:
         env: EnvBase,
         make_env: Callable[[], EnvBase] | None,
         physics: Plant,
-        make_learner: MakeLearner,
-        planner: MakePlanner,
-        referee: MakeReferee,
+        makers: tuple[MakeLearner, MakePlanner, MakeReferee],
         collector: MakeCollector,
         *,
         device: torch.device,
     ) -> None:
-        config = self.config
+        config, (make_learner, planner, referee) = self.config, makers
         generator = torch.Generator(device=device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, physics)
         policies = {role: policy.to(device) for role, policy in config.make_policies(physics, generator).items()}
@@ -365,8 +363,9 @@ class Run:
         if real is not None:
             summary["real_unseen"] = real
         summary["cost_of_learning"] = results.cost_of_learning(self.episodes, self._paid)
-        better = judged[summary["better"]].control_costs
-        summary |= results.reference_entry(self.config, self.unseen, self.make_policy, better)
+        if self.config.reference:
+            better = judged[summary["better"]].control_costs.mean().item()
+            summary["reference"] = results.reference_of(self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})

@@ -170,15 +170,27 @@ def known_physics(
 
     Raises:
         PlantContractError: if a plant breaks its contract.
-        ValueError: if options, controllers, the twin's physics and the real system do not go together.
+        ValueError: if options, controllers, the twin's physics and the real system do not go together, or the twin has
+            states that no sensor of the real system reads, or lacks some that one reads.
     """
     require_plant("plant", plant)
     require_simulation(config, plant, real, baselines)
     believed = config.believed()
-    physics = require_physics(plant, believed or plant)
+    physics = believed or plant
+    known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
+    if known != read:
+        raise ValueError(
+            f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
+            f"{', '.join(read)}, which is all that sensors read; let believed() of the Config give the plant without "
+            "its extensions."
+        )
     for one in filter(None, (plant, believed)):
         check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
-    require_controllers(physics, first, baselines)
+    given: dict[str, object] = {} if first is None else {"first": first}
+    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
+    for name, law in given.items():
+        if not _acts_on_the_real_system(law):
+            require_controller(name, law, physics)
     return physics
 
 
@@ -217,38 +229,3 @@ def require_simulation(
 
 def _acts_on_the_real_system(law: object) -> bool:
     return isinstance(law, type) and issubclass(law, RealController)
-
-
-def require_controllers(
-    physics: Plant, first: type[ClassicalController] | None, baselines: dict[str, type[Baseline]] | None
-) -> None:
-    """Refuse controllers that are no classes, or whose laws do not fit the plant.
-
-    Raises:
-        ValueError: if there is one; the message names it, and says what is expected.
-    """
-    given: dict[str, object] = {} if first is None else {"first": first}
-    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
-    for name, law in given.items():
-        if not _acts_on_the_real_system(law):
-            require_controller(name, law, physics)
-
-
-def require_physics(plant: Plant, physics: Plant) -> Plant:
-    """The physics of the twin of a real system.
-
-    Args:
-        plant: the real system.
-        physics: physics of the twin.
-
-    Raises:
-        ValueError: if the twin has states that no sensor of the real system reads, or lacks some that one reads.
-    """
-    known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
-    if known != read:
-        raise ValueError(
-            f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
-            f"{', '.join(read)}, which is all that sensors read; let believed() of the Config give the plant without "
-            "its extensions."
-        )
-    return physics

@@ -335,7 +335,7 @@ class RealSystem(EnvBase):
 
     def _begun(self, measured: Tensor) -> TensorDict:
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        return self._entries(self._joined(measured), applied, ended=False)
+        return self._entries(self._reported, self._joined(measured), applied, ended=False)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -346,7 +346,6 @@ class RealSystem(EnvBase):
         action = self._actuation.action(command[0]).reshape(spec.shape).to(spec.device, spec.dtype)
         stepped = self.env.step(self._reported.set(self._actuation.key, action))
         self._step_count += 1
-        self._require_reported(stepped["next"])
         if self._applied is None:
             applied = self.plant.actuate(state, command)
         else:
@@ -365,7 +364,7 @@ class RealSystem(EnvBase):
             innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
         cost = self.plant.running_cost(t, state, applied, exogenous)
-        after = self._entries(end, applied, ended=last)
+        after = self._entries(stepped["next"], end, applied, ended=last)
         if over:
             after["done"], after["terminated"] = (torch.ones_like(after["done"]) for _ in range(2))
         if last:
@@ -382,22 +381,15 @@ class RealSystem(EnvBase):
             measured = self._controller.joined(measured.cpu(), self._memory)
         return measured.to(self.device)
 
-    def _require_reported(self, found: TensorDictBase) -> None:
-        """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""
-        readings = {"state": self._state, "exogenous": self._exogenous, "applied": self._applied}
-        for what, reading in readings.items():
-            if isinstance(reading, Reading):
-                reading.require(found, what)
-
-    def _entries(self, state: Tensor, applied: Tensor, *, ended: bool) -> TensorDict:
-        """The environment's present report in the plant's terms."""
-        exogenous = self._input(self._reported).to(self.device)
+    def _entries(self, reported: TensorDictBase, state: Tensor, applied: Tensor, *, ended: bool) -> TensorDict:
+        """The environment's report in the plant's terms."""
+        exogenous = self._input(reported).to(self.device)
         self._present = state, exogenous
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
         flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
         found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
         found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag), "applied": applied}
-        found |= {"refused": self._reported["refused"].reshape(1, 1)} if self._judged else {}
+        found |= {"refused": reported["refused"].reshape(1, 1)} if self._judged else {}
         return TensorDict(found, batch_size=self.batch_size, device=self.device)
 
     def close(self, **kwargs: Any) -> None:
