@@ -124,78 +124,63 @@ def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
 def prediction(run: LoadedRun) -> Figure:
     """Figures 12b, 16b and 22 d to f: states of the twin against real ones, in unseen episodes of the live policy."""
     believed, flown = run.twin.believed, [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
+    again = [believed.replay(one.states[None, 0], one.exogenous[None], one.actions[None]).states[0] for one in flown]
+    real, twin = (array(torch.cat(states)) for states in ([one.states for one in flown], again))
     names = {name.split(" ")[0] for name in run.metrics["summary"]["twin"]["rms"]}
     compared = [k for k, state in enumerate(run.plant.states) if state.name in names]
-    figure, axes = panels(
-        1, len(compared), title=f"{run.plant.name}: twin and reality", size=(4.2 * len(compared), 4.5)
-    )
+    title, size = f"{run.plant.name}: twin and reality", (4.2 * len(compared), 4.5)
+    figure, axes = panels(1, len(compared), title=title, size=size)
     for ax, k in zip(axes.flat, compared, strict=True):
-        signal, errors = run.plant.states[k], []
-        for one in flown:
-            again = believed.replay(one.states[None, 0], one.exogenous[None], one.actions[None]).states[0]
-            ax.plot(array(one.states[:, k]), array(again[:, k]), ".", color=TWIN, markersize=2, alpha=0.4)
-            errors.append(again[:, k] - one.states[:, k])
-        ends = [
-            min(float(one.states[:, k].min()) for one in flown),
-            max(float(one.states[:, k].max()) for one in flown),
-        ]
+        signal, ends = run.plant.states[k], [real[:, k].min(), real[:, k].max()]
+        ax.plot(real[:, k], twin[:, k], ".", color=TWIN, markersize=2, alpha=0.4)
         ax.plot(ends, ends, color="0.5", linewidth=1.0)
         ax.set_xlabel("real")
-        caption(
-            ax,
-            f"twin's {signal.name.replace('_', ' ')} [{signal.unit}]",
-            f"RMS {torch.cat(errors).square().mean().sqrt():.2g}",
-        )
+        rms = np.sqrt(np.mean((twin[:, k] - real[:, k]) ** 2))
+        caption(ax, f"twin's {signal.name.replace('_', ' ')} [{signal.unit}]", f"RMS {rms:.2g}")
     return figure
 
 
 @torch.no_grad()
-def power_over_wind(run: LoadedRun) -> tuple[Figure, str]:
+def power_over_wind(run: LoadedRun) -> Figure:
     """Figure 14b: the power coefficient at the wind speeds of unseen episodes, and its greatest mean."""
     figure, ((ax,),) = panels(1, title="Power coefficient where the turbine operates", size=(6.5, 4.5))
-    winds, found = [], []
-    for seed in range(EPISODES):
-        flown = run.simulate(run.policy(run.live), seed=seed)
-        u = flown.exogenous[:, 0]
-        ratio = flown.states[:-1, 0] * run.plant.radius / u
-        winds.append(u)
-        found.append(run.plant.closure(torch.stack([ratio, flown.actions[:, 1]], -1)).squeeze(-1))
-    u, C_p = array(torch.cat(winds)), array(torch.cat(found))
-    ax.plot(u, C_p, ".", markersize=2, color=ROLES["model_based"], alpha=0.4)
-    bins = np.floor(u)
-    means = [C_p[bins == low].mean() for low in np.unique(bins) if (bins == low).mean() > 0.01]
+    flown = [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
+    u = torch.cat([one.exogenous[:, 0] for one in flown])
+    ratio = torch.cat([one.states[:-1, 0] for one in flown]) * run.plant.radius / u
+    pitch = torch.cat([one.actions[:, 1] for one in flown])
+    C_p, bins = array(run.plant.closure(torch.stack([ratio, pitch], -1)).squeeze(-1)), np.floor(array(u))
+    ax.plot(array(u), C_p, ".", markersize=2, color=ROLES["model_based"], alpha=0.4)
+    greatest = max(C_p[bins == low].mean() for low in np.unique(bins) if (bins == low).mean() > 0.01)
     ax.set_xlabel("wind speed [m/s]")
-    caption(ax, "C_p [-]", f"greatest mean over 1 m/s {max(means):.2g}, paper 0.42")
-    return figure, f"greatest mean C_p over 1 m/s of wind: {max(means):.2g} (paper 0.42)"
+    caption(ax, "C_p [-]", f"greatest mean over 1 m/s {greatest:.2g}, paper 0.42")
+    return figure
 
 
 @torch.no_grad()
-def venting(run: LoadedRun) -> tuple[Figure, str]:
+def venting(run: LoadedRun) -> Figure:
     """Figure 21: the tank vented from 5.4 bar, and figure 21c, the flow over the pressure."""
     start = run.plant.state_at(torch.tensor([START], dtype=torch.float64))
     flown = run.simulate(run.policy(run.live), initial_state=start[0])
     law = run.plant.closure
-    flow = 1e3 * run.plant.vent(flown.states[:-1], flown.actions, law).flow
-    hours = run.plant.dt / 3600.0 * np.arange(len(flow))
+    flow = 1e3 * array(run.plant.vent(flown.states[:-1], flown.actions, law).flow)
     vented = array(run.plant.vented_mass(flown.states, flown.actions, law)[:-1])
-    figure, axes = panels(1, 3, title="Tank vented from 5.4 bar", size=(12.0, 4.0))
-    for ax, values, label in (
-        (axes[0, 0], 1e-3 * array(flown.states[:-1, 2]), "pressure [kPa]"),
-        (axes[0, 1], vented, "vented mass [kg]"),
-    ):
-        ax.plot(hours, values, color=ROLES[run.live])
-        ax.set_xlabel("time [h]")
-        caption(ax, label)
-    axes[0, 1].plot([HOURS], [87.0], "k+", markersize=10, label="paper")
-    axes[0, 2].plot(1e-3 * array(flown.states[:-1, 2]), array(flow), ".", markersize=2, color=ROLES[run.live])
-    axes[0, 2].set_xlabel("pressure [kPa]")
-    caption(axes[0, 2], "vent flow [g/s]", f"greatest {flow.max():.2g}, paper 0.63")
-    legend_below(figure, list(axes.flat))
-    arrived = hours[np.argmax(array(flown.states[:-1, 2]) <= 1.005 * run.plant.set_point)]
-    numbers = (
-        f"greatest flow {flow.max():.2g} g/s (paper 0.63), {np.interp(HOURS, hours, vented):.0f} kg in 45 h (paper 87)"
+    hours, pressure = run.plant.dt / 3600.0 * np.arange(len(flow)), 1e-3 * array(flown.states[:-1, 2])
+    arrived = hours[np.argmax(1e3 * pressure <= 1.005 * run.plant.set_point)]
+    shown = (
+        (hours, pressure, "pressure [kPa]", f"within 0.5 % after {arrived:.0f} h, paper {HOURS:g}"),
+        (hours, vented, "vented mass [kg]", f"{np.interp(HOURS, hours, vented):.0f} in {HOURS:g} h, paper 87"),
+        (pressure, flow, "vent flow [g/s]", f"greatest {flow.max():.2g}, paper 0.63"),
     )
-    return figure, f"{numbers}; within 0.5 % of the set point after {arrived:.0f} h (paper: at it after 45)"
+    figure, axes = panels(1, 3, title="Tank vented from 5.4 bar", size=(12.0, 4.0))
+    for ax, (x, y, label, note) in zip(axes.flat, shown, strict=True):
+        ax.plot(x, y, ".", markersize=2, color=ROLES[run.live])
+        ax.set_xlabel("time [h]" if x is hours else "pressure [kPa]")
+        caption(ax, label, note)
+    return figure
+
+
+OF_A_PLANT = {"wind_turbine": {"power_over_wind": power_over_wind}, "cryogenic_tank": {"venting": venting}}
+"""Figures of one plant alone, by name."""
 
 
 def table(plant: str, metrics: list[dict[str, Any]]) -> str:
@@ -226,16 +211,12 @@ def main(config: Config) -> None:
     run = load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
     drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     drawn["prediction"] = prediction(run)
-    said = [table(config.plant, metrics)]
-    if config.plant != "flapping_wing":
-        name, draw = ("power_over_wind", power_over_wind) if config.plant == "wind_turbine" else ("venting", venting)
-        drawn[name], numbers = draw(run)
-        said.append(f"  {numbers}")
+    drawn |= {name: draw(run) for name, draw in OF_A_PLANT.get(config.plant, {}).items()}
     drawn |= {name: run.figure(name) for name in OF_A_RUN[config.plant]}
     (folder / "figures").mkdir(exist_ok=True)
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
-    print("\n".join(said))
+    print(table(config.plant, metrics))
     print(f"figures in {folder / 'figures'}")
 
 

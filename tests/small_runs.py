@@ -31,6 +31,16 @@ def stepped_cost(episodes, policy):
     return total.mean().item()
 
 
+def believing(physics):
+    """A class of options whose twin believes in some physics."""
+
+    class Believing(RunConfig):
+        def believed(self):
+            return physics
+
+    return Believing
+
+
 def small_run(folder, episodes=3, plant=None, *, config=RunConfig, parts=None, **options):
     """A run of a plant under some options; ``parts`` are further arguments of the run."""
     options = {"unseen": 3, "figures": False, "twinning": SMALL} | options

@@ -34,7 +34,7 @@ def exported(folder, policy, plant, name="discon"):
     """The library of a policy, checked on 10 intervals."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rt_torchrl.export.c_controller.INTERVALS", 10)
-        assert export_discon(policy, folder / f"{name}.c", plant).difference < 1e-9
+        assert export_discon(policy, folder / f"{name}.c", plant) < 1e-9
     return folder / f"lib{name}.so"
 
 

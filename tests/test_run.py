@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_runs import SMALL, small_run, stepped_cost
+from small_runs import SMALL, believing, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
@@ -95,11 +95,7 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     class Heavier(LinearQuadratic):
         B = ((0.0,), (0.75,))
 
-    class Config(RunConfig):
-        def believed(self):
-            return LinearQuadratic(horizon=2.0)
-
-    run = small_run(tmp_path, 1, Heavier(horizon=2.0), config=Config)
+    run = small_run(tmp_path, 1, Heavier(horizon=2.0), config=believing(LinearQuadratic(horizon=2.0)))
     found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
     assert isinstance(run.unseen.plant, Heavier)
@@ -147,8 +143,8 @@ class Dear(Suspecting):
 
 def with_all_parts(folder, episodes, **options):
     """A run on a system with a lag that its twin suspects, and with costs that contradict the twin."""
-    system, parts = LaggedActuator(Dear(horizon=2.0), "force", LAG), {"believed": Suspecting(horizon=2.0)}
-    return small_run(folder, episodes, system, parts=parts, twinning=PARTS, **options)
+    system, config = LaggedActuator(Dear(horizon=2.0), "force", LAG), believing(Suspecting(horizon=2.0))
+    return small_run(folder, episodes, system, config=config, twinning=PARTS, **options)
 
 
 def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, monkeypatch):
@@ -202,9 +198,9 @@ def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
         def observe(self, t, state, exogenous):
             return state.detach()
 
-    for plant, parts in ((Forgetful(), {}), (LinearQuadratic(), {"believed": Forgetful()})):
+    for plant, config in ((Forgetful(), RunConfig), (LinearQuadratic(), believing(Forgetful()))):
         with pytest.raises(PlantContractError, match="observe: autograd finds no dependence on state 'position'"):
-            small_run(tmp_path / "run", 1, plant, parts=parts)
+            small_run(tmp_path / "run", 1, plant, config=config)
     assert not (tmp_path / "run").exists()
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import pytest
+import small_runs
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
@@ -105,12 +106,7 @@ def believing(tmp_path_factory):
     config = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
     options = {"episodes": 1, "unseen": 2, "figures": False, "twinning": twinning}
-
-    class Believing(RunConfig):
-        def believed(self):
-            return known
-
-    Run(Believing(log_dir=folder, **options), LaggedActuator(known, "force", LAG)).train()
+    Run(small_runs.believing(known)(log_dir=folder, **options), LaggedActuator(known, "force", LAG)).train()
     return folder, options | {"start": str(folder)}
 
 

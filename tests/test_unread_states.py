@@ -137,7 +137,7 @@ def test_a_safety_layer_sees_readings_alone(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda folder: Run(small_config(folder), real()), "all that sensors read; give believed"),
+        (lambda folder: Run(RunConfig(log_dir=folder), real()), r"all that sensors read; let believed\(\)"),
         (
             lambda folder: RealSystem(PlantEnv(BASE), real(), state=Reading(keys=("state",))),
             "no sensor reads resonant_force, rate_of_force, bias_of_position",

@@ -2,7 +2,6 @@
 
 import ctypes
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -152,36 +151,28 @@ class CController:
         Raises:
             ValueError: if the two differ by more than ``TOLERANCE``.
         """
-        plant, generator = self.controller.plant, torch.Generator().manual_seed(SEED)
+        controller, plant = self.controller, self.controller.plant
+        generator = torch.Generator().manual_seed(SEED)
         state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-        in_c, in_torch = (torch.cat(x) for x in zip(*self._actions(library, state, exogenous), strict=True))
-        what, rows = f"the controller {self.name} in C", [f"interval {k}" for k in range(len(in_c))]
-        return require_close(in_c, in_torch, action_sizes(plant, in_torch), TOLERANCE, plant.actions, what, rows)
-
-    def _actions(self, library: ctypes.CDLL, state: Tensor, exogenous: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """The action of every interval in C and in torch; the one in C acts."""
-        controller, plant, held = self.controller, self.controller.plant, self.controller.held
-        memory, measured = state[:, held], state[:, controller.measured]
-        command = state.new_zeros(1, len(plant.actions))
         fields = [("steps", ctypes.c_ulonglong), *((array, ctypes.c_double * n) for array, n in self.arrays.items())]
         in_c: Any = type("State", (ctypes.Structure,), {"_fields_": fields})()
+        measured, flown = state[:, controller.measured], list[tuple[Tensor, Tensor]]()
         self._call(library, "init", in_c, measured, exogenous[:, 0])
-        settled, started = list(getattr(in_c, "memory", [])), controller.start(measured, exogenous[:, 0])
-        if not torch.allclose(started.new_tensor([settled]), started, rtol=TOLERANCE, atol=TOLERANCE):
-            raise ValueError(f"{self.name}_init in C starts at {settled} instead of {started.tolist()[0]}.")
-        if held:
-            in_c.memory[:] = memory[0].tolist()
+        memory, command = controller.start(measured, exogenous[:, 0]), state.new_zeros(1, len(plant.actions))
         for k in range(min(plant.n_steps, INTERVALS)):
             t, inputs, following = state.new_tensor([k * plant.dt]), exogenous[:, k], state[:, controller.measured]
-            if k > 0 and held:
+            if k > 0 and controller.held:
                 memory = controller.advance(t - plant.dt, memory, measured, exogenous[:, k - 1], command, following)
             measured = following
             applied = self._call(library, "step", in_c, measured, inputs, len(plant.actions))
+            flown.append((applied, controller.act(t, memory, measured, inputs)[1]))
             command = state.new_tensor([list(in_c.command)])
-            yield applied, controller.act(t, memory, measured, inputs)[1]
             state = plant.step(t, state, command, inputs, plant.closure).state
             if not state.isfinite().all():  # the plant has left its range; what follows is no flight
-                return
+                break
+        of_c, of_torch = (torch.cat(actions) for actions in zip(*flown, strict=True))
+        what, rows = f"the controller {self.name} in C", [f"interval {k}" for k in range(len(of_c))]
+        return require_close(of_c, of_torch, action_sizes(plant, of_torch), TOLERANCE, plant.actions, what, rows)
 
     def _call(
         self, library: ctypes.CDLL, part: str, in_c: Any, measured: Tensor, inputs: Tensor, count: int = 0

@@ -244,9 +244,9 @@ def load_run(
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant
     generator = torch.Generator().manual_seed(config.seed)
-    policies = config.make_policies(physics, generator)
+    made = config.make_policies(physics, generator)
     closure = config.make_closure(physics, generator)
-    policies = config.acting_policies(policies, physics, closure)
+    policies: dict[str, nn.Module] = dict(config.acting_policies(made, physics, closure).items())
     initial = copy.deepcopy(closure)
     for role, part in {**policies, "closure": closure}.items():
         try:
@@ -259,7 +259,7 @@ def load_run(
         plant=plant,
         physics=physics,
         closure=closure,
-        policies=dict(policies.items()),
+        policies=policies,
         initial_closure=initial,
         folder=folder,
     )

@@ -16,12 +16,12 @@ import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
@@ -29,7 +29,6 @@ from torchrl.envs import EnvBase
 from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds, differences
-from rt_torchrl.systems.collectors import together
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.sound_part import sound_part
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -325,16 +324,13 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
     """The sound intervals of a few short flights."""
     noise = ExplorationConfig(spread=spread, correlation_time=CORRELATION * plant.dt)
     live = LivePolicy(plant, policy, noise, generator=generator).to(env.device)
+    act = TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
     parts: list[Flown] = []
     kept = env.state_dict()
     try:
         for _ in range(STARTS):
-            row, rows = env.reset(), list[TensorDictBase]()
             live.begin(policy, strength=1.0)
-            while len(rows) < min(INTERVALS, plant.n_steps) and not row["done"].any():
-                rows.append(env.step(row.set("action", live(row["observation"], row["state"], row["exogenous"]))))
-                row = env.step_mdp(rows[-1])
-            episode = cast(TensorDictBase, together(rows))[0].cpu()
+            episode = env.rollout(min(INTERVALS, plant.n_steps), act)[0].cpu()
             for first, last in sound_part(episode, plant, None).parts:
                 part = episode[first:last]
                 states = torch.cat([part["state"], part["next", "state"][-1:]])
