@@ -271,6 +271,33 @@ def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
 
 
+def test_the_state_is_kept():
+    """What goes on from it makes the same of the next record, in as many rounds."""
+    twin, assimilation = ensemble(PLANT, call=0.05)
+    record, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    assimilation.update([record], (), 1, torch.Generator())
+    assert assimilation.explain(0.06, torch.Generator())
+    other, resumed = ensemble(PLANT, call=0.05)
+    other.load_hypotheses(twin.state_dict()["hypotheses"])
+    other.closure.load_state_dict(twin.closure.state_dict())
+    resumed.load_state_dict(assimilation.state_dict())
+    assert resumed.called and counters(resumed) == counters(assimilation)
+    # The hopeless one waits; the other one is fitted, and in fewer rounds than the first time.
+    assert counters(resumed)["late"][1:] == (1, 2) and counters(resumed)["lags"][0] < 1e-6
+    for one in (assimilation, resumed):
+        one.update([record], (), 1, torch.Generator())
+    assert other.weights == twin.weights == {"lags": 1.0} and resumed.misfits == assimilation.misfits
+    assert counters(resumed) == counters(assimilation) and counters(resumed)["late"][1:] == (0, 2)
+    for name, one in twin.twins.items():
+        for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
+            assert torch.equal(mine, its)
+
+
+def counters(assimilation):
+    turns = assimilation.turns
+    return {name: (fit.least, turns[name].waiting, turns[name].pause) for name, fit in assimilation.fits.items()}
+
+
 def test_hypotheses_are_chosen_by_name():
     twin, _ = ensemble(PLANT, which=("late",))
     assert list(twin.twins) == [ALONE, "late"]

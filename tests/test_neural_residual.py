@@ -10,7 +10,7 @@ from test_trajectory import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, check_plant
+from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, Plant, check_plant
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -77,6 +77,19 @@ def test_it_begins_as_the_plant_itself(base):
     flown = [Rollout(p, p.closure, engine="autograd")(state, exogenous, command).states for p in (plant, base)]
     assert torch.equal(*flown)
     assert plant.states == base.states and plant.unread == base.unread and plant.own_scheme == base.own_scheme
+
+
+def test_a_plant_that_wraps_a_runge_kutta_step_takes_one_of_the_sum():
+    class Wrapping(LinearQuadratic):
+        def advance(self, *given):
+            return super().advance(*given)
+
+    plant = pushed(Wrapping())
+    closure = stirred(plant.make_closure(torch.Generator()))
+    (state, exogenous, command), t = flight(plant), torch.zeros(1).double()
+    assert not plant.own_scheme
+    arguments = t, state, command[:, 0], exogenous[:, 0], closure
+    torch.testing.assert_close(plant.advance(*arguments), Plant.advance(plant, *arguments), rtol=1e-14, atol=0.0)
 
 
 def test_around_another_scheme_it_is_of_second_order():
