@@ -7,8 +7,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
 from traced_function import Bounded, Recurrent, Rows
 
-from rt_torchrl import Signal
-from rt_torchrl.plants.plant import Transition
+from rt_torchrl import Signal, Transition
 from rt_torchrl.plants.policies import mlp
 
 PLACE, SPEED = LinearQuadratic.states

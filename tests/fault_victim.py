@@ -8,6 +8,7 @@ from pathlib import Path
 
 from small_runs import SMALL, small_run
 
+from rt_torchrl import Run, RunConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -15,8 +16,6 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
 
 EPISODES = 5
 QUICK = {"figures": False}

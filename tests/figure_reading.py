@@ -6,9 +6,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl import Rollout, Snapshot, Trajectory
 
 
 def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapshot:

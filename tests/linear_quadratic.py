@@ -11,8 +11,7 @@ import torch
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 from torch import nn
 
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl import Plant, Signal
 
 
 class LinearClosure(nn.Module):

@@ -6,12 +6,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from rt_torchrl.fit.sensors import sensor_record, sensors_of
-from rt_torchrl.plants.closures import PositiveCoefficients
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl import Plant, PositiveCoefficients, Rollout, Trajectory, sensor_record, sensors_of
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Slope(nn.Module):

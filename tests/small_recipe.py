@@ -5,8 +5,7 @@ from dataclasses import field
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 
-from rt_torchrl import Run, RunConfig, TwinningConfig
-from rt_torchrl.options import configuration
+from rt_torchrl import Run, RunConfig, TwinningConfig, configuration
 
 
 @configuration

@@ -3,10 +3,7 @@
 import torch
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import HypothesesConfig, LearnerConfig, RefereeConfig, TwinningConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl import ExplorationConfig, HypothesesConfig, LearnerConfig, RefereeConfig, Run, RunConfig, TwinningConfig
 
 SMALL = TwinningConfig(
     hypotheses=HypothesesConfig(which=("none",)),  # a twin that has hardly learned would call for them

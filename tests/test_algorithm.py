@@ -9,9 +9,8 @@ from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from printed_commands import documented
 from tensordict import TensorDict
 
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, PlantEnv, ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.config import (
     AssimilationConfig,
@@ -21,9 +20,6 @@ from rt_torchrl.steps.config import (
     TwinningConfig,
     other_than,
 )
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 

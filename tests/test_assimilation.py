@@ -10,12 +10,10 @@ from seeds_and_numbers import seeded
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
+from rt_torchrl import AssimilationConfig, DigitalTwin, Rollout
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig
-from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import batch_of, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 WINDS = (1.0, -2.0)
 

@@ -9,7 +9,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from tensordict import TensorDict
 from test_algorithm import flown, twinning
 
-from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, Rollout, Scenario, Trajectory
 from rt_torchrl.steps.belief import HISTORY, Belief, alarm, difference
 from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
@@ -17,10 +17,6 @@ from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.learn import Learn
 from rt_torchrl.steps.report import findings
 from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
 QUIET = ExplorationConfig(spread=0.0)

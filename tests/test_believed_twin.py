@@ -10,17 +10,13 @@ from small_runs import SMALL
 from test_export_recipe import recipe
 from test_hypotheses import Suspecting, ensemble
 
-from rt_torchrl import Run, control_cost, export_twin, load_run
+from rt_torchrl import BiasedSensor, DigitalTwin, Run, RunConfig, configuration, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.export.c_file import c_array
-from rt_torchrl.options import configuration
 from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.results import hypothesis_lines, results_table
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, extended
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 LAG = 0.35
 

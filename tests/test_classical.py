@@ -4,17 +4,14 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl import ClassicalController, DivergenceError, SaturatedAffine, control_cost
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import flights_of
 from rt_torchrl.steps.config import ROLES
-from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import control_cost
 
 
 class PD(ClassicalController):

@@ -9,17 +9,12 @@ from small_runs import SMALL
 from test_algorithm import flown as after
 from test_algorithm import twinning
 
-from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl import ClassicalController, OperatingLimits, PlantEnv, Run, RunConfig, SafetyLayer, Trajectory
 from rt_torchrl.options import read_options
 from rt_torchrl.runs.real_side import simulated
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import as_written
 from rt_torchrl.steps.config import RefereeConfig, other_than
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
 

@@ -6,7 +6,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
-from rt_torchrl import shipped_plants
+from rt_torchrl import DivergenceError, PlantEnv, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -14,9 +14,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def system(plant, **options):

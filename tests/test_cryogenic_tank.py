@@ -8,10 +8,9 @@ import pytest
 import torch
 from seeds_and_numbers import double, seeded
 
+from rt_torchrl import DivergenceError, Rollout, rk4_step
 from rt_torchrl.envs.cryogenic_tank.closures import CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.plants.sampling import rk4_step
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 
 # A separate reading of the cryogenic tank with CoolProp, and its books of mass and energy.
 

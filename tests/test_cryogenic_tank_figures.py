@@ -7,12 +7,11 @@ import pytest
 import torch
 from figure_reading import draw, line, panel, snapshot_of
 
+from rt_torchrl import Snapshot, Trajectory
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.training import closure_weights
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
 TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}

@@ -12,13 +12,12 @@ from linear_quadratic import LinearQuadratic
 from printed_commands import TEXTS, blocks
 from seeds_and_numbers import seeded
 
-from rt_torchrl import DISCON, StateFeedback, export_discon
+from rt_torchrl import DISCON, SaturatedAffine, StateFeedback, export_discon
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.controller import Controller
-from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.trajectories.state_feedback import Remembering
 
 N_G = 97.0

@@ -7,14 +7,12 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
 from test_algorithm import LEARNING, STEPS, flown, twinning, weights
 
-from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl import DigitalTwin, SaturatedAffine, SaturatedMLP, Scenario
 from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig, other_than
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import same_architecture
-from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANT = LinearQuadratic(horizon=2.0)
 

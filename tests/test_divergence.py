@@ -7,11 +7,8 @@ import torch
 from tensordict import TensorDict
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl import figures
-from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.steps.config import AssimilationConfig, RefereeConfig
+from rt_torchrl import AssimilationConfig, DivergenceError, RefereeConfig, Snapshot, figures
 from rt_torchrl.steps.report import EpisodeReport, findings
-from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def fill(module, number):

@@ -16,13 +16,10 @@ from tensordict import TensorDict
 from test_export_recipe import RECIPES, leave_run
 
 import rt_torchrl
-from rt_torchrl import check_plant
+from rt_torchrl import AssimilationConfig, HypothesesConfig, Rollout, Trajectory, check_plant
 from rt_torchrl.atomic_file import write_json
-from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 RUN_HERE = "README finished_run gallery habits hypotheses own_plant unknown_systems".split()
 

@@ -4,8 +4,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl import DivergenceError, PlantEnv
 
 
 def act(env, found, action):

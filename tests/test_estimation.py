@@ -10,6 +10,7 @@ from printed_commands import blocks
 from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, room_records
 from test_uncertainty import position
 
+from rt_torchrl import DigitalTwin, Measurement
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, judged
@@ -22,8 +23,6 @@ from rt_torchrl.fit.sensors import (
     sensor_record,
     sensors_of,
 )
-from rt_torchrl.plants.signal import Measurement
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def test_derivatives_are_those_of_backpropagation():

@@ -9,14 +9,12 @@ from scipy.optimize import minimize
 from seeds_and_numbers import double
 from small_runs import small_run, stepped_cost
 
-from rt_torchrl import SaturatedMLP
+from rt_torchrl import SaturatedAffine, SaturatedMLP, StickingActuator
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
-from rt_torchrl.plants.actuators import StickingActuator
-from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd

@@ -7,11 +7,9 @@ import pytest
 import torch
 from seeds_and_numbers import seeded
 
+from rt_torchrl import DigitalTwin, ExogenousConfig, Signal
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.signal import Signal
-from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.inputs import ExogenousProcess, VirtualEpisodes, mixed
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5

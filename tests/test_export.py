@@ -12,9 +12,8 @@ from seeds_and_numbers import seeded
 from test_run_folder import Full
 from torch import nn
 
-from rt_torchrl import export_c, shipped_plants
+from rt_torchrl import SaturatedMLP, export_c, shipped_plants
 from rt_torchrl.export.program import export_onnx, export_program
-from rt_torchrl.plants.policies import SaturatedMLP
 
 # The same operations in double precision, at most in another order.
 ROUNDING = 1e-12

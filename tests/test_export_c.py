@@ -15,10 +15,9 @@ from snippets import TABLE
 from test_export import Law
 from traced_function import signals
 
-from rt_torchrl import export_c, shipped_plants
+from rt_torchrl import SaturatedMLP, export_c, shipped_plants
 from rt_torchrl.export import c_file
 from rt_torchrl.export.c_file import c_array
-from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.programs.c_source import CSource, literal
 from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.trajectories.engines.interval import Drive

@@ -10,15 +10,12 @@ from c_build import library, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import seeded
 
-from rt_torchrl import export_controller, export_twin, shipped_plants
+from rt_torchrl import Rollout, SaturatedAffine, Signal, export_controller, export_twin, shipped_plants
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.export.controller import Controller
-from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.programs.c_source import CSource
-from rt_torchrl.trajectories.rollout import Rollout
 
 CLOSE = 1e-9
 

@@ -9,20 +9,14 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_algorithm import twinning
 
+from rt_torchrl import DigitalTwin, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import RefereeConfig
-from rt_torchrl.systems.config import SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import Reading, RealSystem
-from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.systems.sound_part import GREATEST
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 DT, N = 0.1, 40
 

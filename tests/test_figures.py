@@ -12,8 +12,7 @@ from figure_reading import clipped_texts, collisions, draw, line
 from linear_quadratic import LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
-from rt_torchrl import figures
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Signal, Snapshot, figures
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -23,15 +22,10 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import flights
-from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES
 from rt_torchrl.figures.training import RESOLUTION, visited_observations
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 EVERYWHERE = {"states", "policy_contours", "learning_curves"}
 

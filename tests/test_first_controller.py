@@ -7,9 +7,8 @@ from small_runs import small_run
 from test_algorithm import twinning
 from test_classical import PD
 
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig
+from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.start import FirstController
 
 GAINS = (0.4, 0.3)
 

@@ -10,12 +10,9 @@ import pytest
 import torch
 from c_build import needs_compiler
 
+from rt_torchrl import FMUEnvironment, FMUError, Reading, RealSystem, Rollout, export_policy_fmu, export_twin_fmu
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export import c_file
-from rt_torchrl.export.fmu import export_policy_fmu, export_twin_fmu
-from rt_torchrl.systems.adapters import FMUEnvironment, FMUError
-from rt_torchrl.systems.real_system import Reading, RealSystem
-from rt_torchrl.trajectories.rollout import Rollout
 
 fmpy = pytest.importorskip("fmpy")
 PLANT = WindTurbine(horizon=20.0)

@@ -7,10 +7,9 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from tensordict import TensorDict
 
-from rt_torchrl import PlantEnv, ReinforcementTwinning, TwinningConfig
+from rt_torchrl import DigitalTwin, ExtendedClosure, PlantEnv, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
-from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, twin_entries
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
@@ -26,7 +25,6 @@ from rt_torchrl.steps.hypotheses.assimilation import (
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")

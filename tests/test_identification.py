@@ -10,19 +10,14 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, flown, line_segment
 from test_export_recipe import recipe
 
+from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
-from rt_torchrl.plants.closures import PositiveCoefficients
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 pd = pytest.importorskip("pandas")
 RECIPES = Path(__file__).parent.parent / "recipes"

@@ -13,10 +13,8 @@ from torch import nn
 from torch.utils._pytree import tree_flatten
 from torchrl.objectives import DDPGLoss
 
-from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.steps.config import LearnerConfig
+from rt_torchrl import LearnerConfig, Rollout, SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, Iteration, LearningMethod, LongTermMemory
-from rt_torchrl.trajectories.rollout import Rollout
 
 GAMMA = 0.9
 PLANT = LinearQuadratic()

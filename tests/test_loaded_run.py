@@ -17,16 +17,13 @@ from test_documentation import leave_finished_run
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
 
-from rt_torchrl import load_run
+from rt_torchrl import HypothesesConfig, RunConfig, SaturatedMLP, load_run
 from rt_torchrl.options import choices
-from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs import settings as settings_module
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps import interact
-from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.systems.sound_part import SoundPart, sound_part
 

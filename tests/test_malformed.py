@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic
 
+from rt_torchrl import OperatingLimits, OperatingLimitsConfig, RunConfig
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
@@ -25,11 +26,8 @@ from rt_torchrl.fit.log import SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import INTERVALS_PER_ROW, resample
 from rt_torchrl.options import read_options
 from rt_torchrl.runs import run_folder
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import load_tensors, save_tensors
 from rt_torchrl.runs.settings import BESIDE, as_written, read_settings
-from rt_torchrl.systems.config import OperatingLimitsConfig
-from rt_torchrl.systems.safety import OperatingLimits
 
 PLANT = LinearQuadratic(horizon=2.0)
 

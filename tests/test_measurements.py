@@ -4,13 +4,10 @@ import pytest
 import torch
 from seeds_and_numbers import double, seeded
 
-from rt_torchrl import Rollout, SaturatedAffine, check_plant, shipped_plants
+from rt_torchrl import DigitalTwin, ExogenousConfig, Rollout, SaturatedAffine, Trajectory, check_plant, shipped_plants
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 CHOICES = [(name, kind, which) for name, kind in shipped_plants().items() for which in kind.observation_sets]

@@ -10,7 +10,7 @@ from test_trajectory import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, Plant, check_plant
+from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, Plant, Rollout, check_plant
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -20,7 +20,6 @@ from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 

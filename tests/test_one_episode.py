@@ -9,10 +9,9 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictPrioritizedReplayBuffer
 from torchrl.objectives import DDPGLoss
 
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import ReinforcementTwinning, Run
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.run import Run
 
 ROOT = Path(__file__).parents[1]
 HERE = (str(ROOT / "rt_torchrl"), str(ROOT / "envs"))

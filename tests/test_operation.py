@@ -13,16 +13,12 @@ from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from test_faults import require_true
 
+from rt_torchrl import ExplorationConfig, OperatingLimits, PlantEnv, Reading, RealSystem, RunConfig, SafetyLayer
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.real_side import learner_threads
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems import operation as module
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operation import Operation, Operator
-from rt_torchrl.systems.real_system import Reading, RealSystem
-from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 
 QUIET = ExplorationConfig(episodes=0)

@@ -13,16 +13,14 @@ from seeds_and_numbers import seeded
 from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
 
+from rt_torchrl import AssimilationConfig, DigitalTwin, Trajectory
 from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
 from rt_torchrl.fit.log import checked
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 recorded = recipe("record_log").recorded
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"

@@ -10,15 +10,13 @@ from test_algorithm import twinning, weights
 from test_belief import EPISODES, REFUTED, Content, belief_of, gains, said
 from test_first_controller import begun
 
+from rt_torchrl import Descended, DescentConfig, DigitalTwin, Scenario
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.steps import plan
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes, extreme_states
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
-from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 CPU = torch.device("cpu")
 

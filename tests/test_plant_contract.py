@@ -10,12 +10,10 @@ from seeds_and_numbers import seeded
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import DelayedActuator, ScaledActuator, Transition, check_plant, shipped_plants
+from rt_torchrl import DelayedActuator, PlantEnv, Rollout, ScaledActuator, Transition, check_plant, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 

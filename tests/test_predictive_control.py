@@ -11,15 +11,11 @@ from printed_commands import blocks
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
 
-from rt_torchrl.control.forecasts import Decaying
+from rt_torchrl import Decaying, DivergenceError, PlantEnv, Rollout, StateFeedback, control_cost
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.systems.collectors import collector_of
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import control_cost
 
 PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
 

@@ -9,12 +9,8 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import RECIPES, recipe
 
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")

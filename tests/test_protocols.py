@@ -11,13 +11,10 @@ from printed_commands import documented
 from seeds_and_numbers import seeded
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import DigitalTwin, Planner, PlantEnv, ReinforcementTwinning, WholeEpisodes
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
-from rt_torchrl.steps.plan import Planner, WholeEpisodes
 from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANT = LinearQuadratic(horizon=2.0)
 SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}

@@ -15,13 +15,8 @@ from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
+from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
-from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.config import SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.safety import SafetyLayer
 
 STEPS = 20
 

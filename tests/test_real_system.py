@@ -16,10 +16,9 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem, SafetyConfig, SafetyLayer
+from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem, Run, SafetyConfig, SafetyLayer
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.adapters import CallingSimulator
 

@@ -13,12 +13,10 @@ import torch
 from pydantic import Field
 from test_export_recipe import RECIPES, recipe
 
-from rt_torchrl import Plant, rk4_step
-from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl import DescentConfig, Plant, RunConfig, rk4_step
 from rt_torchrl.options import File, Limit, Widths, configuration, read_options
 from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.run_config import RunConfig
 
 
 def test_weights_of_another_task_are_refused():

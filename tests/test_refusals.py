@@ -18,9 +18,8 @@ from torch import nn
 from traced_function import sections
 
 import rt_torchrl
-from rt_torchrl import ConnectedPlant, PlannerConfig
+from rt_torchrl import ConnectedPlant, PlannerConfig, PredictiveConfig, PredictiveControl, RecedingHorizon, Rollout
 from rt_torchrl.contract.check import require_controller
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
@@ -28,7 +27,6 @@ from rt_torchrl.fit.log import Column, checked, read_log
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.settings import module_of
 from rt_torchrl.steps.inputs import ExogenousProcess
-from rt_torchrl.trajectories.rollout import Rollout
 
 MODULES = """
     control.command_cost control.forecasts control.predictive_control evaluation.optimum

@@ -13,6 +13,7 @@ from small_plants import Room, room_records
 from test_export_recipe import recipe
 from test_log import PLANT, jittered, signals
 
+from rt_torchrl import AssimilationConfig, DigitalTwin, Rollout
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -31,10 +32,7 @@ from rt_torchrl.fit.resampling import (
     sensors_in,
 )
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.steps.hypotheses.assimilation import reread
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 pd = pytest.importorskip("pandas")
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_algorithm import STEPS, twinning
 from test_export_recipe import RECIPES
 
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import PlannerConfig, ReinforcementTwinning, TwinningConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
@@ -24,7 +24,6 @@ from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.results import closure_lines, fit_lines, next_steps, results_table
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.steps.config import PlannerConfig, TwinningConfig
 
 
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):

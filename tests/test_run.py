@@ -13,17 +13,12 @@ from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
 from torchrl.collectors import Collector
 
-from rt_torchrl import PlantContractError
-from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl import ExplorationConfig, LaggedActuator, PlantContractError, Rollout, RunConfig, identification_cost
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
 from rt_torchrl.steps.plan import MakePlan, make_planner
 from rt_torchrl.steps.switch import make_referee
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import identification_cost
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):

@@ -15,14 +15,13 @@ import torch
 from small_runs import small_run
 from torch import nn
 
+from rt_torchrl import OperationConfig, RunConfig
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.options import read_options
 from rt_torchrl.runs import run_folder
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings
 from rt_torchrl.steps.plan import MakePlan
-from rt_torchrl.systems.config import OperationConfig
 
 
 def begun(path, **options):

@@ -13,9 +13,7 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl.systems.config import SafetyConfig
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.real_system import Reading, RealSystem
+from rt_torchrl import PlantEnv, Reading, RealSystem, SafetyConfig
 from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, layer_of
 from rt_torchrl.systems.sound_part import report_of
 

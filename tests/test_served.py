@@ -16,10 +16,7 @@ from served_plants import free_port, served, served_turbine_alone
 from served_turbine import ServedPlant, machine
 from tensordict import TensorDict
 
-from rt_torchrl.systems.machine.connected_plant import ConnectedPlant, LinkLostError
-from rt_torchrl.systems.machine.modbus import ModbusLink, Register
-from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl import ConnectedPlant, LinkLostError, ModbusLink, RealSystem, Register, Rollout
 
 PLANT = LinearQuadratic(horizon=2.0)
 TAGS = ServedPlant(PLANT, (0.0,))

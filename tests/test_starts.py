@@ -13,20 +13,12 @@ from test_export_recipe import recipe
 from test_hypotheses import ASSIMILATION as NEWTON
 from test_hypotheses import LAG, Suspecting
 
+from rt_torchrl import LogConfig, PlantEnv, Run, RunConfig, SaturatedMLP, Signal, Trajectory, TwinEnsemble, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.plants.policies import SaturatedMLP
-from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig
-from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.start import transitions_of
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 record_log = recipe("record_log")
 recorded = record_log.recorded

@@ -12,17 +12,16 @@ from linear_quadratic import LinearQuadratic
 from torch import nn
 from traced_function import Recurrent, Rows, Snippet, compared, gap, signals, traced
 
+from rt_torchrl import DigitalTwin, PlantEnv
 from rt_torchrl.programs.contract import ImpureError
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines import code
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 EQUAL, REFUSED, IMPURE, MIXED = (snippets.TABLE[name] for name in ("equal", "refused", "impure", "mixed"))
 REMEDIES = r"; (use|make|write|take|multiply|eliminate|they belong|machine code has|compute) |raises"

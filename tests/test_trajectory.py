@@ -15,18 +15,15 @@ from seeds_and_numbers import double
 from torch import nn
 from torchdiffeq import odeint
 
-from rt_torchrl import shipped_plants
+from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Rollout, shipped_plants
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, rk4_step
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)

@@ -12,12 +12,11 @@ from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
+from rt_torchrl import DigitalTwin, Estimation, EstimationConfig
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
 from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty, named_values
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_export_recipe import RECIPES, leave_run
 
-from rt_torchrl import check_plant, load_run
+from rt_torchrl import Rollout, UnreadInput, check_plant, load_run
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing import unknown as drones
@@ -15,7 +15,6 @@ from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.trajectories.rollout import Rollout
 
 KNOWN = {
     "wind_turbine": (turbines, lambda: WindTurbine(horizon=20.0, observe=("scheduled",))),
