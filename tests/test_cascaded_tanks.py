@@ -118,21 +118,6 @@ def test_the_record_is_read_from_a_file_or_the_package(tmp_path, monkeypatch):
         read_benchmark(None)
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        (None, "cannot be read"),
-        ("uEst,uVal\n1,2\n", "needs yEst, yVal, too"),
-        ("uEst,uVal,yEst,yVal\n1,,2,3\n", "missing"),
-    ],
-)
-def test_a_file_that_is_no_record_is_refused(tmp_path, text, message):
-    if text is not None:
-        (tmp_path / "data.csv").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_benchmark(tmp_path / "data.csv")
-
-
 def test_every_part_of_a_record_is_held_out_once():
     made = recipe("cascaded_tanks")
     record = made.sensor_record_of(np.linspace(1.0, 2.0, 401), np.linspace(3.0, 5.0, 401))

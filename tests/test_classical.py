@@ -4,7 +4,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl import ClassicalController, DivergenceError, SaturatedAffine, control_cost
+from rt_torchrl import ClassicalController, DivergenceError, SaturatedAffine
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -31,36 +31,6 @@ LOAD = torch.tensor([[130.0]], dtype=torch.float64)
 def episodes(plant, count=6, size=0.3):
     generator = torch.Generator().manual_seed(0)
     return size * plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
-
-
-def test_a_flight_is_the_plants_steps_under_the_saturated_command():
-    plant = LinearQuadratic(horizon=3.0)
-    state, exogenous = episodes(plant, size=3.0)
-    flown = PD(plant, (2.0, 1.0)).fly(state, exogenous)
-    assert flown.states.shape == (6, 31, 2) and flown.actions.shape == (6, 30, 1)
-    for k in range(plant.n_steps):
-        command = (-2.0 * state[:, :1] - 1.0 * state[:, 1:]).clamp(-2.0, 2.0)
-        t = torch.tensor(k * plant.dt, dtype=torch.float64)
-        state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
-        torch.testing.assert_close(flown.states[:, k + 1], state, rtol=1e-13, atol=1e-13)
-        torch.testing.assert_close(flown.actions[:, k], applied, rtol=1e-13, atol=1e-13)
-    assert (flown.actions.abs() == 2.0).any()
-
-
-def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
-    plant = LinearQuadratic(horizon=3.0)
-    worn = LinearClosure(0.5 * torch.tensor(plant.true_closure))
-    state, exogenous = episodes(plant)
-    flown = PD(plant).fly(state, exogenous, worn)
-    t = torch.zeros(1, dtype=torch.float64)
-    end = plant.step(t, state, flown.actions[:, 0], exogenous[:, 0], worn).state
-    torch.testing.assert_close(flown.states[:, 1], end, rtol=1e-13, atol=1e-13)
-    unseen = UnseenEpisodes(plant, 4)
-    unseen.closure = worn
-    affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
-    judged = unseen.judge(flights_of(unseen, dict.fromkeys(ROLES, affine), {"PD": PD(plant)})["PD"])
-    own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
-    assert torch.equal(judged.control_costs, control_cost(plant, own))
 
 
 class FeedForward(PD):

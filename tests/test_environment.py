@@ -18,32 +18,6 @@ def uniform_actions(env, seed):
     return low + share * (high - low)
 
 
-class Clock(LinearQuadratic):
-    """A plant whose observation, motion and cost depend on the time."""
-
-    def vector_field(self, t, state, action, exogenous, closure):
-        return torch.ones_like(state) * t.unsqueeze(-1)
-
-    def observe(self, t, state, exogenous):
-        return torch.ones_like(state) * t.unsqueeze(-1)
-
-    def running_cost(self, t, state, applied, exogenous):
-        return t.expand_as(state[..., 0])
-
-
-def test_clock_is_that_of_the_twin_to_the_last_bit():
-    """t_k = k dt in double precision, in the observation, the cost and the field: s_n − s_0 = ½T²."""
-    env = PlantEnv(Clock(dt=0.1, horizon=5.0))
-    episode = env.rollout(50)
-    t = 0.1 * torch.arange(51, dtype=torch.float64)
-    assert torch.equal(episode["observation"], t[:-1, None].expand(1, 50, 2))
-    assert torch.equal(episode["next", "observation"], t[1:, None].expand(1, 50, 2))
-    assert torch.equal(episode["next", "reward"][..., 0], -t[:-1].expand(1, 50))
-    moved = episode["next", "state"][:, -1] - episode["state"][:, 0]
-    # Exact quadrature of a linear function: rounding of 50 sums.
-    torch.testing.assert_close(moved, torch.full((1, 2), 12.5, dtype=torch.float64), rtol=1e-13, atol=0)
-
-
 class Explosive(LinearClosure):
     def forward(self, features):
         return 1e3 * features**3

@@ -11,8 +11,6 @@ from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, r
 from test_uncertainty import position
 
 from rt_torchrl import DigitalTwin, Measurement
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, judged
 from rt_torchrl.fit.sensors import (
     Sensor,
@@ -133,19 +131,6 @@ def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
     slopes = read_slopes(sensors, plant, *(x[None] for x in given[1:]))
     assert slopes[0, :, 0].tolist() == [[0.0, 0.0], [1.0, 0.0]]
     assert list(known_sensors(plant)) == ["position", "velocity"]
-
-
-@pytest.mark.parametrize(
-    "kind, name",
-    [(FlappingWing, "error_x"), (FlappingWing, "height"), (WindTurbine, "rotor_speed")],
-)
-def test_states_and_measurements_of_a_plant_are_sensors(kind, name):
-    plant = kind()
-    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
-    (found,) = read(sensors_of(plant, [name]), plant, torch.zeros(1).double(), state, torch.ones(1, 1).double())[0]
-    names = [signal.name for signal in plant.states]
-    expected = state[0, names.index(name)].item() if name in names else 5.0  # the way from the origin to the target
-    assert found.item() == pytest.approx(expected)
 
 
 def test_the_example_of_the_documentation_runs():

@@ -164,6 +164,7 @@ ELEMENTWISE = {
     "rounding": lambda x: x[0].round(),
     "floor, ceiling and truncation": lambda x: x[0].floor() + x[0].ceil() + x[0].trunc(),
     "absolute value": lambda x: x[0].abs(),
+    "at least and at most": lambda x: (x[0] >= x[1]).double() - 2.0 * (x[0] <= x[1]).double(),
     "quotient": lambda x: x[0] / x[1],
     "product with zero": lambda x: 0.0 * x[0],
 }

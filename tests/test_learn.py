@@ -423,11 +423,6 @@ def test_state_round_trip_samples_the_same():
     assert labels(first) == labels(second) and 1.0 not in labels(second) and 0.0 in labels(second)
 
 
-def test_an_episode_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="11 transitions at once do not fit a long-term memory of 10"):
-        memory().store(labelled(list(range(11))), torch.ones(11))
-
-
 def test_a_critic_that_has_diverged_is_told_before_the_memory_takes_its_errors():
     found, episode = learner(return_steps=1), explored(4)
     with torch.no_grad():

@@ -58,9 +58,13 @@ def saved(state):
     return torch.load(file, weights_only=True)
 
 
+UNLIKE = {name: LEARNERS[name] for name in ("ddpg", "sac", "crossq", "documented")}
+"""Learners with states of different kinds."""
+
+
 @pytest.mark.parametrize(
     "part, protocol, makers",
-    [("learner", Learner, LEARNERS), ("planner", Planner, PLANNERS), ("referee", Referee, REFEREES)],
+    [("learner", Learner, UNLIKE), ("planner", Planner, PLANNERS), ("referee", Referee, REFEREES)],
 )
 def test_a_training_with_each_goes_on_from_its_state_as_if_never_interrupted(part, protocol, makers):
     """The result is the same to the bit; the other two parts are the default ones."""

@@ -8,17 +8,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import study
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import double, seeded
+from tensordict import TensorDict
 from test_classical import PD
 from test_hypotheses import Suspecting
 from test_real_system import WIND, Rig, connected
+from test_study import TINY
 from torch import nn
 from traced_function import sections
 
 import rt_torchrl
-from rt_torchrl import ConnectedPlant, PlannerConfig, PredictiveConfig, PredictiveControl, RecedingHorizon, Rollout
+from rt_torchrl import (
+    ConnectedPlant,
+    ModbusLink,
+    PlannerConfig,
+    PredictiveConfig,
+    PredictiveControl,
+    RecedingHorizon,
+    Register,
+    Rollout,
+)
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.wind_turbine import unknown as turbines
@@ -30,13 +42,13 @@ from rt_torchrl.steps.inputs import ExogenousProcess
 
 MODULES = """
     control.command_cost control.forecasts control.predictive_control evaluation.optimum
-    envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
+    envs.cascaded_tanks.record envs.cryogenic_tank.closures envs.cryogenic_tank.disturbances envs.cryogenic_tank.plant
     envs.cryogenic_tank.unknown envs.flapping_wing.closures
     envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real
     envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
     envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log
-    plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble steps.plan systems.config
-    systems.exploration systems.safety
+    plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble steps.learn steps.plan
+    systems.config systems.exploration systems.safety
 """.split()
 """Modules of the library whose names expressions may use beside the public ones."""
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -76,6 +88,16 @@ TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,
 
 def log(table, *columns):
     return checked(read_log(text(table), LQ, [Column.parse(column) for column in columns]), LQ)
+
+
+def studied(**options):
+    usual = {"systems": (f"tiny={TINY}",), "arms": ("twinning",), "log_dir": Path(tempfile.mkdtemp())}
+    study.studied(study.Config(**usual | options))
+
+
+def modbus(**options):
+    client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", **options)
+    return ModbusLink(client, {"a": Register(0)}, {"b": Register(4)})
 
 
 def law(method=PD.law, **own):
@@ -139,7 +161,7 @@ class Names(dict):
 
 HERE = Names(globals())
 LAGGED = HERE["LAGGED"] = rt_torchrl.LaggedActuator(LQ, "force", 0.4)
-READ_BY_THE_TABLE = WIND, LinearClosure, Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
+READ_BY_THE_TABLE = TensorDict, WIND, LinearClosure, Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.parts[0])

@@ -219,24 +219,6 @@ def test_systems_and_arms_have_names(tmp_path):
     }
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seeds": 0}, "seeds=0 must be at least 1"),
-        ({"arms": ()}, "arms names none"),
-        ({"arms": ("sac",)}, "'sac' has no name; write NAME=OPTIONS, or one of twinning"),
-        ({"arms": ("a=", "a=--noise 2")}, "'a' stands for two"),
-        ({"systems": ("moon=",)}, "names no recipe"),
-        ({"given": "--seed 3"}, "--seed: the study gives these to each training"),
-        ({"arms": ("x=--log_dir=y",)}, "--log_dir=y: the study gives"),
-        ({"systems": ("moon",)}, "moon.py does not exist"),
-    ],
-)
-def test_what_is_no_study_is_refused(tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        study.studied(config(tmp_path, **options))
-
-
 def test_two_arms_and_two_seeds(tmp_path, capsys):
     """The same command again trains nothing; more episodes go on, and other options are refused."""
     arms = {"arms": ("twinning", "model_based")}

@@ -23,7 +23,7 @@ from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, 
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
-from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
+from rt_torchrl.trajectories.trajectory import identification_cost
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)
@@ -64,30 +64,6 @@ def test_converges_to_the_matrix_exponential(engine):
     assert math.log2(errors[1] / errors[2]) == pytest.approx(4.0, abs=0.15), errors
     # dt⁴/120 over 8 s for states and inputs of about 2: 1.3e-5.
     assert errors[2] < 3e-5
-
-
-def test_segments_are_parts_on_the_clock_of_the_plant():
-    plant = LinearQuadratic(horizon=1.0)
-    state, exogenous, command = drawn(plant, 2)
-    flown = Rollout(plant, plant.closure)(state, exogenous, command, start=3.0)._replace(seen=torch.rand(2, 11) > 0.5)
-    segments = flown.segments(4, plant.dt).each()  # the last two intervals are left out
-    parts = [flown.rows(k).part(first, first + 4, plant.dt) for k in (0, 1) for first in (0, 4)]
-    assert [part.start for part in parts] == [3.0, 3.4, 3.0, 3.4] == [segment.start for segment in segments]
-    for part, segment in zip(parts, segments, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(part, segment, strict=True) if isinstance(a, torch.Tensor))
-        assert part.states.shape == (5, 2) and part.seen.shape == (5,) and part.actions.shape == (4, 1)
-
-
-def test_identification_cost_of_a_growing_error():
-    """Error (t, 0): J_p = dt Σ ½t_k² over k = 1 ... n = ½dt³ n(n + 1)(2n + 1)/6; the start does not count."""
-    plant, n, h = LinearQuadratic(dt=0.1, horizon=4.0), 40, 0.1
-    states = torch.randn(2, n + 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    error = torch.stack([h * torch.arange(n + 1), torch.zeros(n + 1)], -1).double()
-    error[0] = 7.0
-    cost = identification_cost(plant, Trajectory(states, states[:, :-1, :1], states[:, :-1, :1]), states + error)
-    expected = 0.5 * h**3 * n * (n + 1) * (2 * n + 1) / 6
-    # Differences of numbers of order four: 1e-15 of them; dt in single precision would give 1e-8.
-    torch.testing.assert_close(cost, torch.full((2,), expected, dtype=torch.float64), rtol=1e-6, atol=0)
 
 
 def test_records_that_are_no_numbers_or_do_not_fit_are_refused(unchecked):

@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 import torch
 from interval_coverage import CASES, LOGS, coverage, logged, recorded
-from linear_quadratic import LinearClosure
-from small_plants import Line, Slope, flown, line_segment, noise_of
+from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig
-from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of, state_sensors
-from rt_torchrl.fit.uncertainty import Uncertainty, named_values
+from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of
 
 ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)
@@ -119,23 +115,6 @@ def test_standard_errors_are_those_of_regression(smooth):
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
     # that in the error; the window takes another few per cent of the correlation and of the trend.
     assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
-
-
-def test_named_errors_follow_from_those_of_the_logarithms():
-    """The standard error of a = e^w is, to first order, σ_a = a σ_w."""
-    plant = FlappingWing(horizon=0.03)
-    (segment,) = flown(plant, torch.Generator().manual_seed(0), (60,))
-    closure = QuasiSteadyPolar.true().requires_grad_(True)
-    noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    sensors = state_sensors(plant)
-    record = sensor_record(plant, sensors, segment._replace(states=segment.states + noise, start=0.0))
-    task = Estimation(DigitalTwin(plant, closure), sensors, spread=torch.zeros(4).double())
-    found = Uncertainty(task.likelihood([record]), errors="robust")
-    expected = closure.coefficients.detach() * found.weights_covariance.diagonal().sqrt()
-    errors = found.standard_errors()
-    assert list(errors) == ["a", "b", "c"]
-    assert list(errors.values()) == pytest.approx(expected.tolist(), rel=1e-9)
-    assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]
 
 
 def test_a_simulation_starts_where_its_first_samples_say():

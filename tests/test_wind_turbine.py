@@ -17,7 +17,7 @@ from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
-from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, PaperCost, WindTurbine
+from rt_torchrl.envs.wind_turbine.plant import PaperCost, WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.evaluation.unseen import RealEpisodes
@@ -70,18 +70,6 @@ def test_time_constant_of_the_drivetrain(c_p):
     # Central difference of a spline: h² of its curvature, and rounding 1e-16/1e-5.
     assert found == pytest.approx(-J / slope, rel=1e-6)
     assert found == pytest.approx(16.5, rel=0.05)  # the expected figure, from the published inertia, to two digits
-
-
-def test_hub_inertia_is_refused_at_the_papers_step_and_runs_at_a_tenth():
-    message = (
-        r"dt=0\.5 s makes plant 'wind_turbine' unstable: the rotor of inertia 115926 kg m² decays at .* 1/s, .*"
-        r"Use dt <= 0\.12\d* s, or the inertia of the whole drivetrain, 4\.37847e\+07 kg m²"
-    )
-    with pytest.raises(ValueError, match=message):
-        WindTurbine(inertia=HUB_INERTIA)
-    plant = WindTurbine(inertia=HUB_INERTIA, dt=0.1, horizon=60.0)
-    # The note in the class: the rotor would follow the wind within 44 ms.
-    assert plant.time_constant(11.4) == pytest.approx(0.044, abs=5e-4)
 
 
 @pytest.mark.parametrize("u, beta, tau_g, bracket", [(12.0, 5.0, 30e3, (0.9, 2.0)), (15.0, 11.0, 40e3, (0.9, 2.0))])
