@@ -8,24 +8,19 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
+from rt_torchrl import DigitalTwin, ExogenousConfig, Extension, LaggedActuator, Plant, Signal, Transition
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.unknown import unknown as tank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.flapping_wing.unknown import unknown as drone
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
-from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.plant import Plant, Transition
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
-from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def flown_on(real, policy, physics, *, seed=0, count=2, noise=0.0):

@@ -33,6 +33,20 @@ def episodes(plant, count=6, size=0.3):
     return size * plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
 
 
+def test_a_flight_is_the_plants_steps_under_the_saturated_command():
+    plant = LinearQuadratic(horizon=3.0)
+    state, exogenous = episodes(plant, size=3.0)
+    flown = PD(plant, (2.0, 1.0)).fly(state, exogenous)
+    assert flown.states.shape == (6, 31, 2) and flown.actions.shape == (6, 30, 1)
+    for k in range(plant.n_steps):
+        command = (-2.0 * state[:, :1] - 1.0 * state[:, 1:]).clamp(-2.0, 2.0)
+        t = torch.tensor(k * plant.dt, dtype=torch.float64)
+        state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
+        torch.testing.assert_close(flown.states[:, k + 1], state, rtol=1e-13, atol=1e-13)
+        torch.testing.assert_close(flown.actions[:, k], applied, rtol=1e-13, atol=1e-13)
+    assert (flown.actions.abs() == 2.0).any()
+
+
 class FeedForward(PD):
     """A PD law that cancels the measured disturbance, and keeps its sum."""
 

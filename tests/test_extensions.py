@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from seeds_and_numbers import seeded
 from torch import nn
 
-from rt_torchrl import check_plant
+from rt_torchrl import ExtendedClosure, Extension, PositiveCoefficients, Rollout, Signal, check_plant
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.plants.actuators import (
     DelayedActuator,
@@ -20,13 +20,9 @@ from rt_torchrl.plants.actuators import (
     ScaledActuator,
     StickingActuator,
 )
-from rt_torchrl.plants.closures import PositiveCoefficients
-from rt_torchrl.plants.extension import ExtendedClosure, Extension
 from rt_torchrl.plants.plant import PARTS, Plant
 from rt_torchrl.plants.sensors import BiasedSensor, StackedObservations
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import NeuralResidual, ScaledCoefficients
-from rt_torchrl.trajectories.rollout import Rollout
 
 DT = 0.1
 

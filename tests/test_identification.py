@@ -13,7 +13,7 @@ from test_export_recipe import recipe
 from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
 from rt_torchrl.steps.assimilate import Assimilation
@@ -149,6 +149,17 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
     # A twin that explains the readings over whole records is fitted over these.
     calm = [record.part(0, 20, plant.dt) for record in records]
     assert estimation(None).run(calm).segment == 0
+
+
+def test_of_segments_that_are_followed_alike_the_longest_stay():
+    """Over thirds the errors are not small enough, but less than three times those over ninths."""
+    errors, closure = {0: 10.0, 2: 0.5, 30: 1.2, 10: 0.6}, LinearClosure(torch.zeros(2, 2))
+
+    def fit(length):
+        torch.nn.init.constant_(closure.matrix, length)
+        return length, torch.tensor([errors[length]])
+
+    assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 30 and (closure.matrix == 30.0).all()
 
 
 class Runaway(Line):

@@ -15,7 +15,7 @@ from seeds_and_numbers import double
 from torch import nn
 from torchdiffeq import odeint
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Rollout, shipped_plants
+from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Rollout, identification_cost, shipped_plants
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
@@ -23,7 +23,6 @@ from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, 
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
-from rt_torchrl.trajectories.trajectory import identification_cost
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)
@@ -64,6 +63,18 @@ def test_converges_to_the_matrix_exponential(engine):
     assert math.log2(errors[1] / errors[2]) == pytest.approx(4.0, abs=0.15), errors
     # dt⁴/120 over 8 s for states and inputs of about 2: 1.3e-5.
     assert errors[2] < 3e-5
+
+
+def test_segments_are_parts_on_the_clock_of_the_plant():
+    plant = LinearQuadratic(horizon=1.0)
+    state, exogenous, command = drawn(plant, 2)
+    flown = Rollout(plant, plant.closure)(state, exogenous, command, start=3.0)._replace(seen=torch.rand(2, 11) > 0.5)
+    segments = flown.segments(4, plant.dt).each()  # the last two intervals are left out
+    parts = [flown.rows(k).part(first, first + 4, plant.dt) for k in (0, 1) for first in (0, 4)]
+    assert [part.start for part in parts] == [3.0, 3.4, 3.0, 3.4] == [segment.start for segment in segments]
+    for part, segment in zip(parts, segments, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(part, segment, strict=True) if isinstance(a, torch.Tensor))
+        assert part.states.shape == (5, 2) and part.seen.shape == (5,) and part.actions.shape == (4, 1)
 
 
 def test_records_that_are_no_numbers_or_do_not_fit_are_refused(unchecked):

@@ -11,8 +11,7 @@ from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
-from rt_torchrl import DigitalTwin, Estimation, EstimationConfig
-from rt_torchrl.fit.sensors import Sensor, sensor_record, sensors_of
+from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Sensor, sensor_record, sensors_of
 
 ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)

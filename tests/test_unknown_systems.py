@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_export_recipe import RECIPES, leave_run
 
-from rt_torchrl import Rollout, UnreadInput, check_plant, load_run
+from rt_torchrl import Rollout, check_plant, load_run
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing import unknown as drones
