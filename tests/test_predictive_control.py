@@ -1,11 +1,12 @@
 """Model predictive control: its plans beside quadratic programs and Riccati, its forecasts, and in a policy's place."""
 
+import copy
 import math
 
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from printed_commands import blocks
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import seeded
@@ -109,6 +110,19 @@ def test_it_flies_to_a_target_that_has_moved():
     moved, anew = (each.fly(start, inputs).states for each in (controller, control(plant)))
     torch.testing.assert_close(moved, anew, rtol=1e-9, atol=1e-12)
     assert abs(still) < 1e-6 and moved[0, -1, 0] > 0.2
+
+
+def test_it_plans_on_the_closure_as_it_is_trained():
+    """With the true closure it costs less than with a wrong one, and a copy keeps the closure that it has."""
+    closure = LinearClosure(torch.tensor([[0.0, 0.0], [6.0, 0.0]]))
+    controller, (state, exogenous) = control(closure=closure), episodes(batch=4)
+    wrong, kept = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean(), copy.deepcopy(controller)
+    with torch.no_grad():
+        closure.matrix.copy_(PLANT.closure.matrix)
+    right = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean()
+    assert right < 0.95 * wrong
+    torch.testing.assert_close(control_cost(PLANT, kept.fly(state, exogenous, PLANT.closure)).mean(), wrong)
+    assert {name for name, _ in controller.named_parameters()} == {"closure.matrix"}
 
 
 class Fragile(LinearQuadratic):
