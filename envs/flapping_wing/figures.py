@@ -31,7 +31,7 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 
 
 def flight_path(snapshot: Snapshot) -> Figure:
-    """The last flight in the vertical plane with the wind at each second; wind and distance to the target over time.
+    """The last flight in the vertical plane with a mark at each second; wind and distance to the target over time.
 
     The axes span the real flight and the target; a twin that flies elsewhere leaves them.
     """
@@ -50,7 +50,6 @@ def flight_path(snapshot: Snapshot) -> Figure:
 
 def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
-    wind = array(snapshot.record.exogenous)[:, 0]
     ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label=style.record_label(snapshot))
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
     ax.plot(*array(plant.target), "*", color=style.REFERENCE, markersize=15, label="target")
@@ -59,24 +58,10 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     ax.margins(0.09)
     second = np.arange(round(1.0 / plant.dt), len(real), round(1.0 / plant.dt))
     ax.plot(*real[second, :2].T, "o", color=REAL, markersize=4.5, label="every second")
-    look: dict[str, Any] = {"color": SAMPLES, "width": 0.005, "zorder": 3, "units": "width", "scale_units": "width"}
-    arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), scale=24.0, **look)
-    key = {"labelpos": "N", "coordinates": "axes", "angle": 180.0, "fontproperties": {"size": 9}}
-    ax.quiverkey(arrows, 0.9, 0.06, 2.0, "wind 2 m/s", **key)
-    _label_seconds(ax, real[second, :2])
     ax.set_aspect("equal", adjustable="datalim")
     caption(ax, "vertical plane")
     ax.set_xlabel(plant.states[0].label)
     ax.set_ylabel(plant.states[1].label)
-
-
-def _label_seconds(ax: Axes, places: Float[np.ndarray, "seconds 2"]) -> None:
-    """Number the seconds, except those in which the drone has hardly moved since the last number."""
-    near, last = 0.07 * np.ptp(ax.get_xlim()), np.full(2, np.inf)
-    for second, place in enumerate(places, 1):
-        if not np.linalg.norm(place - last) < near:
-            ax.annotate(f"{second} s", place, (7, -11), textcoords="offset points", fontsize=8.5)
-            last = place
 
 
 def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
@@ -88,9 +73,8 @@ def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
         mean = array(snapshot.large_scale)[:, 0]
         ax.plot(time, mean, color=style.LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
     ax.axhline(strongest, **style.LIMIT_LINE)
-    # The text stands on the line itself, because the legend has no room for it.
-    text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "center"}
-    text["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
+    # The text stands under the line itself, because the legend has no room for it.
+    text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "top"}
     ax.annotate("strongest that can be held", (0.99, strongest), xycoords=("axes fraction", "data"), **text)
     ax.set_ylim(min(0.0, recorded.min()) - 0.2, 1.15 * max(strongest, recorded.max()))
     caption(ax, plant.inputs[0].label)

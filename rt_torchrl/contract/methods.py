@@ -150,18 +150,16 @@ def method(calls: Calls, method: Method) -> Iterator[str]:
     yield from [*_shapes(method, together)] or [*_purity(method, together)] or [*_rows(method, together)]
 
 
-def _row(arguments: Arguments, k: int, b: int | None = None) -> Arguments:
-    """The arguments at time k, of all episodes with a time of shape ``1``, or of episode b alone with a scalar time."""
-    if b is None:
-        return {name: value[k] for name, value in arguments.items()}
-    return {name: value[k, 0] if name == "t" else value[k, b] for name, value in arguments.items()}
+def _cases(arguments: Arguments) -> list[Arguments]:
+    """The arguments of one state, of a batch, and of all times; the case that is easiest to get right comes first."""
+    places = (0, 0), (0,), ()
+    return [{name: value[place] for name, value in arguments.items()} for place in places]
 
 
 def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
-    """The first wrong shape; the case that is easiest to get right comes first."""
-    times, batch = arguments["state"].shape[:2]
-    cases = {(): _row(arguments, 0, 0), (batch,): _row(arguments, 0), (times, batch): arguments}
-    for lead, case in cases.items():
+    """The first wrong shape."""
+    for case in _cases(arguments):
+        lead = case["state"].shape[:-1]
         outputs = method.outputs(case)
         if len(outputs) != len(method.gives):
             yield f"{method.name}: gives {len(outputs)} values; expected {', '.join(method.gives)} as a Transition."
@@ -184,7 +182,7 @@ def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
     if changed:
         yield f"{method.name}: changes its argument {' and '.join(changed)} in place; make a new tensor instead."
         return
-    method.outputs(_row(given, 1))
+    method.outputs({name: value[1] for name, value in given.items()})
     method.outputs({name: value[:1].expand_as(value) for name, value in given.items()})
     if not all(map(torch.equal, first, method.outputs(given))):
         yield f"{method.name}: gives something else when it is called again with the same arguments. {PURE}."
@@ -192,11 +190,10 @@ def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
 
 def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
     """A violation if the results of a batch differ from those of its rows one by one."""
-    times, batch = arguments["state"].shape[:2]
-    rows = [[method.outputs(_row(arguments, k, b)) for b in range(batch)] for k in range(times)]
-    for place, (name, together) in enumerate(zip(method.gives, method.outputs(arguments), strict=True)):
-        alone = torch.stack([torch.stack([found[place] for found in row]) for row in rows])
-        gap = ((together - alone).abs() / (1e-6 + alone.abs().amax((0, 1)))).max()
+    outputs = zip(*map(method.outputs, _cases(arguments)), strict=True)
+    for name, (alone, batch, together) in zip(method.gives, outputs, strict=True):
+        size = 1e-6 + together.abs().amax((0, 1))
+        gap = max(((first - found).abs() / size).max() for first, found in ((together[0], batch), (batch[0], alone)))
         if gap > TOLERANCE:
             yield (
                 f"{method.name}: {name} of a batch differs from that of its rows one by one, by {gap:.1e} of its size; "
@@ -208,18 +205,18 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
 def judgement(calls: Calls) -> Iterator[str]:
     """Violations in merit and setpoints of whole episodes."""
     state, applied, exogenous = (calls.arguments[name].transpose(0, 1) for name in ("state", "applied", "exogenous"))
-    batch = len(state)
+    batch, steps = state.shape[:2]
     for key, pair in calls.plant.setpoints(state, applied, exogenous).items():
         for what, value in zip(("value", "setpoint"), pair, strict=True):
-            if problem := misshapen(value, state.shape[:2]):
+            if problem := misshapen(value, (batch, steps)):
                 yield (
-                    f"setpoints: the {what} of {key!r} has {problem} for {batch} episodes of {state.shape[1]} control "
-                    f"intervals; expected {wanted_as(state.shape[:2])}."
+                    f"setpoints: the {what} of {key!r} has {problem} for {batch} episodes of {steps} control "
+                    f"intervals; expected {wanted_as((batch, steps))}."
                 )
     for key, value in calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]).items():
-        if not isinstance(value, Tensor) or tuple(value.shape) != (batch,) or value.dtype != torch.float64:
-            given = f"{tuple(value.shape)} in {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
-            yield f"merit: {key!r} is {given} for {batch} episodes; expected shape ({batch},) in torch.float64."
+        known = value.nan_to_num() if isinstance(value, Tensor) else value  # which not every episode has
+        if problem := misshapen(known, (batch,)):
+            yield f"merit: {key!r} has {problem} for {batch} episodes; expected shape ({batch},) in torch.float64."
 
 
 @torch.no_grad()

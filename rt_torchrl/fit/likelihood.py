@@ -18,7 +18,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, held_to_the_end, read, read_slopes, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
@@ -59,16 +58,6 @@ class WeightPrior:
     def cost(self) -> Tensor:
         """The cost, differentiable by the weights."""
         return 0.5 * self.stiffness * (self.held * (self.weights() - self.start).square()).sum()
-
-    def added(self, found: NormalEquations) -> NormalEquations:
-        """Normal equations, whose first unknowns are the weights, with the prior."""
-        if not self.stiffness:
-            return found
-        rest = len(found.gradient) - len(self.start)
-        each = self.stiffness * self.held
-        pull = pad(each * (self.weights() - self.start), (0, rest))
-        matrix = found.matrix + torch.diag(pad(each, (0, rest)))
-        return NormalEquations(found.cost + self.cost(), found.gradient + pull, matrix)
 
 
 class Offsets(nn.Module):
@@ -201,11 +190,17 @@ class Likelihood:
         """Number of samples of each sensor."""
         return torch.stack([group.seen.sum((0, 1)) for group in self._groups]).sum(0)
 
-    @property
-    def first_stiffness(self) -> Float[Tensor, "records n_free"]:
-        """Stiffness of the offsets of every initial state about its guess."""
-        stiffness = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
-        return stiffness.expand(len(self.records), -1)
+    def _priors(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """The stiffness of every unknown about the value at which a prior holds it, and its distance from there."""
+        offsets = self.initial.offsets
+        stiffness, distance = offsets.new_zeros(self.count), offsets.new_zeros(self.count)
+        of_states = slice(self._shown, self._shown + offsets.numel())
+        each = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+        stiffness[of_states], distance[of_states] = each.expand_as(offsets).flatten(), offsets.flatten()
+        if self.prior is not None and self._shown:
+            stiffness[: self._shown] = self.prior.stiffness * self.prior.held
+            distance[: self._shown] = self.prior.weights() - self.prior.start
+        return stiffness, distance
 
     @torch.no_grad()
     def replays(self) -> list[Replays]:
@@ -289,17 +284,12 @@ class Likelihood:
             cost = cost + 0.5 * r.square().sum()
             gradient.index_put_((places,), (A.mT @ r.unsqueeze(-1)).squeeze(-1), accumulate=True)
             matrix.index_put_((places.unsqueeze(-1), places.unsqueeze(-2)), A.mT @ A, accumulate=True)
-        stiffness, offsets = self.first_stiffness, self.initial.offsets
-        held = slice(self._shown, self._shown + offsets.numel())
-        gradient[held] += (stiffness * offsets).flatten()
-        matrix.diagonal()[held] += stiffness.flatten()
-        equations = NormalEquations(cost + 0.5 * (stiffness * offsets.square()).sum(), gradient, matrix)
-        return self.prior.added(equations) if self.prior is not None and self._shown else equations
+        stiffness, distance = self._priors()
+        matrix.diagonal().add_(stiffness)
+        cost = cost + 0.5 * (stiffness * distance.square()).sum()
+        return NormalEquations(cost, gradient + stiffness * distance, matrix)
 
+    @torch.no_grad()
     def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
         """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
-        n, stiffness = self.weight_count, self.first_stiffness.flatten()
-        determined = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
-        if self.prior is not None:
-            determined = determined + (self.prior.stiffness * self.prior.held * inverse.diagonal()[:n]).sum()
-        return float(determined)
+        return float((self._priors()[0] * inverse.diagonal()).sum())

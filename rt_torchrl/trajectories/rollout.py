@@ -160,18 +160,14 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
     if not ENGINES[engine].exact and (plant.own_scheme or plant.end_cost is not None):
         does = "steps by a scheme of its own" if plant.own_scheme else "has episodes that end early"
-        return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use {_exact()}."
+        exact = ", ".join(name for name, kind in ENGINES.items() if kind.exact)
+        return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use one of {exact}."
     return None
 
 
 def able(engine: Engine, plant: Plant) -> Engine:
     """The engine, or ``autograd`` for a plant that it cannot roll out, such as one with a scheme of its own."""
     return "autograd" if engine in ENGINES and refusal(engine, plant) else engine
-
-
-def _exact() -> str:
-    *others, last = (name for name, kind in ENGINES.items() if kind.exact)
-    return f"{', '.join(others)} or {last}"
 
 
 def all_finite(x: Tensor) -> bool:

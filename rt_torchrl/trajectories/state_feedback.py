@@ -3,10 +3,10 @@
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Memory, Starts, State
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -22,9 +22,7 @@ class StateFeedback(Protocol):
     def begin(self) -> None:
         """Begin an episode; everything that takes long is done here, before the first action is due."""
 
-    def act(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n_a"]:
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
         """The command of the control interval at t [s]; the intervals follow each other.
 
         Args:
@@ -34,12 +32,7 @@ class StateFeedback(Protocol):
         """
 
     def fly(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        closure: nn.Module | None = None,
-        *,
-        plant: Plant | None = None,
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
         """Episodes of a simulated system, side by side, with no regard to wall-clock time.
 
@@ -61,15 +54,10 @@ class StateFeedback(Protocol):
 class Remembering(Protocol):
     """State feedback that is a function of state, memory and inputs alone, so that an interval with it is traced."""
 
-    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
+    def first_memory(self, state: State) -> Memory:
         """Memory at the start of an episode."""
 
-    def respond(
-        self,
-        state: Float[Tensor, "batch n_s"],
-        memory: Float[Tensor, "batch n_m"],
-        exogenous: Float[Tensor, "batch n_z"],
-    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+    def respond(self, state: State, memory: Memory, exogenous: Input) -> tuple[Action, Memory]:
         """The command, within the ranges of the actions, and the new memory."""
 
 
@@ -78,9 +66,7 @@ class RememberingInterval(Interval):
 
     policy: Any
 
-    def answer(
-        self, carry: Float[Tensor, "batch n_c"], drive: Drive
-    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+    def answer(self, carry: Tensor, drive: Drive) -> tuple[Action, Memory]:
         """The command and the new memory; a subclass may read the drive's command, of any width."""
         read, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
         command, memory = self.policy.respond(read, memory, drive.exogenous)
@@ -99,7 +85,7 @@ class RememberingInterval(Interval):
 
 
 @torch.no_grad()
-def commands_along(controller: StateFeedback, flown: Trajectory, dt: float) -> Float[Tensor, "batch n n_a"]:
+def commands_along(controller: StateFeedback, flown: Trajectory, dt: float) -> Actions:
     """The commands of a controller in states that another one has reached.
 
     Args:

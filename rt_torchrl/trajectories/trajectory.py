@@ -37,14 +37,7 @@ class Trajectory(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
         """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
-        states, actions, exogenous, start, seen = self
-        return type(self)(
-            change(states),
-            change(actions),
-            change(exogenous),
-            change(start) if isinstance(start, Tensor) else start,
-            None if seen is None else change(seen),
-        )
+        return type(self)(*(change(part) if isinstance(part, Tensor) else part for part in self))
 
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
@@ -66,21 +59,18 @@ class Trajectory(NamedTuple):
             dt: control interval [s].
         """
         states, actions, exogenous, start, seen = self
-        batch, count = len(states), actions.shape[1] // length
-        n = count * length
 
-        def pieces(samples: Tensor) -> Tensor:
-            parts = [samples[:, k * length : (k + 1) * length + 1] for k in range(count)]
-            return torch.stack(parts, 1).flatten(0, 1)
+        def pieces(samples: Tensor, size: int) -> Tensor:
+            return samples.unfold(1, size, length).flatten(0, 1).movedim(-1, 1).contiguous()
 
-        time = dt * length * torch.arange(count, dtype=torch.float64, device=states.device)
-        first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(batch)
+        times = dt * length * torch.arange(actions.shape[1] // length, dtype=torch.float64, device=states.device)
+        first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(len(states))
         return Trajectory(
-            pieces(states),
-            actions[:, :n].unflatten(1, (count, length)).flatten(0, 1),
-            exogenous[:, :n].unflatten(1, (count, length)).flatten(0, 1),
-            (first.unsqueeze(-1) + time).flatten(),
-            None if seen is None else pieces(seen),
+            pieces(states, length + 1),
+            pieces(actions, length),
+            pieces(exogenous, length),
+            (first.unsqueeze(-1) + times).flatten(),
+            None if seen is None else pieces(seen, length + 1),
         )
 
     def rows(self, chosen: int | Int[Tensor, " m"]) -> "Trajectory":
