@@ -109,6 +109,7 @@ class Config(RunConfig):
             error would cost as much, by default 12 h; 0 is the paper's J_a, whose optimum stops venting 12 h before the
             end.
         horizon: length of an episode T_o [s].
+        fluid: pure fluid in the tank: Hydrogen, ParaHydrogen, Nitrogen, Oxygen or Methane.
         noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
             twinning.assimilation.initial is estimated.
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
@@ -125,6 +126,7 @@ class Config(RunConfig):
     end_weight: float = 43.2e3
     closure: Literal["paper", "mlp"] = "paper"
     horizon: float = 4.32e5
+    fluid: str = "Hydrogen"
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
@@ -169,6 +171,7 @@ class Config(RunConfig):
         """The tank as its twin knows it."""
         return CryogenicTank(
             horizon=self.horizon,
+            fluid=self.fluid,
             cost=self.cost(),
             command=self.command,
             observe=self.observe,

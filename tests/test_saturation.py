@@ -6,18 +6,18 @@ import CoolProp.CoolProp as CP
 import numpy as np
 import pytest
 import torch
+from saturation_tables import HIGH, LOW, table_of
 from seeds_and_numbers import double
 
 from rt_torchrl.envs.cryogenic_tank import saturation
-from rt_torchrl.envs.cryogenic_tank.saturation import Saturation
+from rt_torchrl.envs.cryogenic_tank.saturation import DATA, FLUIDS, Saturation
 
-LOW, HIGH = 80e3, 900e3
 KEYS = (("T", 0), ("D", 0), ("D", 1), ("H", 0), ("H", 1))
 
 
-def slopes_of_coolprop(p):
+def slopes_of_coolprop(fluid, p):
     """First derivatives of T, ρ and h along the saturation line by CoolProp itself."""
-    state, columns = CP.AbstractState("HEOS", "Hydrogen"), []
+    state, columns = CP.AbstractState("HEOS", fluid), []
     for key, quality in ((CP.iT, 0), (CP.iDmass, 0), (CP.iDmass, 1), (CP.iHmass, 0), (CP.iHmass, 1)):
         column = []
         for each in p:
@@ -30,13 +30,21 @@ def slopes_of_coolprop(p):
 # Properties
 
 
-def test_values_and_slopes_are_those_of_coolprop():
+@pytest.mark.parametrize("fluid", FLUIDS)
+def test_values_and_slopes_are_those_of_coolprop(fluid):
     p = np.linspace(LOW, HIGH, 301)  # no nodes of the fit, except for the two ends
-    values, slopes = (np.stack([x.numpy() for x in part]) for part in Saturation().with_slopes(torch.from_numpy(p)))
-    truth = np.array([CP.PropsSI(key, "P", p, "Q", quality, "Hydrogen") for key, quality in KEYS])
+    values, slopes = (
+        np.stack([x.numpy() for x in part]) for part in Saturation(fluid).with_slopes(torch.from_numpy(p))
+    )
+    truth = np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS])
     assert (np.abs(values - truth).max(1) < 1e-6 * np.abs(truth).max(1)).all()
-    truth, slopes = slopes_of_coolprop(p[1:-1]), slopes[:, 1:-1]
+    truth, slopes = slopes_of_coolprop(fluid, p[1:-1]), slopes[:, 1:-1]
     assert (np.abs(slopes - truth).max(1) < 1e-4 * np.abs(truth).max(1)).all()
+
+
+def test_the_tables_are_those_that_coolprop_makes():
+    assert {file.stem for file in DATA.iterdir()} == {*FLUIDS}
+    np.testing.assert_allclose(np.loadtxt(DATA / "Hydrogen.csv", delimiter=","), table_of("Hydrogen"), rtol=1e-9)
 
 
 def test_derivatives_of_values_and_slopes():
@@ -74,7 +82,7 @@ def test_outside_the_range_everything_is_nan_and_check_raises(p):
     fit = Saturation()
     values, slopes = fit.with_slopes(double(p, 500e3))
     assert all(x[0].isnan() and x[1].isfinite() for x in (*values, *slopes))
-    with pytest.raises(ValueError, match="hydrogen, 80 … 900 kPa"):
+    with pytest.raises(ValueError, match="Hydrogen, 80 … 900 kPa"):
         fit.check(double(p, 500e3))
 
 

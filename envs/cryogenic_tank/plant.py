@@ -162,6 +162,7 @@ class CryogenicTank(Plant):
         horizon: length of an episode T_o [s].
         closure: closure of the real tank, from :meth:`features` to U_s, U_HX, K_JT; None for the paper's constants.
         load: source of the heat load.
+        fluid: pure fluid in the tank, one of those of :mod:`saturation`.
         wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         cost: running and terminal cost of J_a; None for the paper's.
         command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
@@ -169,7 +170,7 @@ class CryogenicTank(Plant):
         observe: names of ``measurements`` and ``observation_sets``; by default the paper's error.
 
     Raises:
-        ValueError: for an unknown command, a size that is not positive, or a wall too light for the step.
+        ValueError: for an unknown fluid or command, a size that is not positive, or a wall too light for the step.
     """
 
     name = "cryogenic_tank"
@@ -214,6 +215,7 @@ class CryogenicTank(Plant):
         horizon: float = 4.32e5,
         closure: nn.Module | None = None,
         load: DisturbanceModel | None = None,
+        fluid: str = "Hydrogen",
         wall_heat_capacity: float = 500e3,
         cost: TankCost | None = None,
         command: Literal["drop", "duty"] = "drop",
@@ -229,7 +231,7 @@ class CryogenicTank(Plant):
         self.wall_heat_capacity = float(wall_heat_capacity)
         self.command, self.actions = command, (COMMANDS[command],)
         self.cost = PressureCost() if cost is None else cost
-        self.saturation = Saturation()
+        self.saturation = Saturation(fluid)
         mode, rate = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K", self.wall_rate(self.closure)
         require_stable_step(self.name, dt, rate, mode=mode, remedy="a heavier wall")
 

@@ -1,4 +1,4 @@
-"""Saturation properties of hydrogen as differentiable functions of pressure."""
+"""Saturation properties of a pure fluid as differentiable functions of pressure."""
 
 import math
 from functools import cache
@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-DATA = Path(__file__).parent / "data" / "hydrogen.csv"
+DATA = Path(__file__).parent / "data"
+FLUIDS = ("Hydrogen", "ParaHydrogen", "Nitrogen", "Oxygen", "Methane")
+"""Fluids of which there is a table; hydrogen is normal, and becomes parahydrogen when it is stored."""
 CELLS, DEGREE = 128, 5
-"""Number of pieces of the spline, and their degree: values err by 1e-7 of their maximum, slopes by 2e-6."""
+"""Number of pieces of the spline, and their degree: values of hydrogen err by 1e-7, slopes by 2e-6."""
 
 
 class Properties(NamedTuple):
@@ -26,7 +28,7 @@ class Properties(NamedTuple):
 
 
 class Saturation(nn.Module):
-    r"""T, ρ_l, ρ_v, h_l and h_v of normal hydrogen over its saturation pressure, 80 … 900 kPa.
+    r"""T, ρ_l, ρ_v, h_l and h_v of a pure fluid over its saturation pressure, 80 … 900 kPa.
 
     The functions are quintic splines in ln p through values of CoolProp on an even grid. A floor gives the cell of
     a pressure, one gather the coefficients of all properties, and Horner's rule their values and slopes,
@@ -39,15 +41,23 @@ class Saturation(nn.Module):
     Outside the range of pressure a property is NaN, never its value at the nearest end. A trajectory that leaves the
     range therefore stops with the library's ``DivergenceError``. :meth:`check` refuses such pressures at once.
 
+    Args:
+        fluid: name of the fluid, one of ``FLUIDS``.
+
+    Raises:
+        ValueError: if there is no table of the fluid.
+
     Source: C. de Boor, *A Practical Guide to Splines*, chapter IX; I. H. Bell et al., *Ind. Eng. Chem. Res.* 53 (2014)
     2498 (CoolProp).
     """
 
     table: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, fluid: str = "Hydrogen"):
         super().__init__()
-        self.low, self.high, table = coefficients()
+        if fluid not in FLUIDS:
+            raise ValueError(f"fluid={fluid!r} has no table; choose one of {', '.join(FLUIDS)}.")
+        self.fluid, (self.low, self.high, table) = fluid, coefficients(fluid)
         self.register_buffer("table", torch.tensor(table))
         self._width = math.log(self.high / self.low) / CELLS
 
@@ -81,7 +91,7 @@ class Saturation(nn.Module):
             offenders = p[outside]
             worst = offenders[(offenders - 0.5 * (self.low + self.high)).abs().argmax()].item()
             raise ValueError(
-                f"pressure p={worst / 1e3:g} kPa is outside the saturation table of hydrogen, "
+                f"pressure p={worst / 1e3:g} kPa is outside the saturation table of {self.fluid}, "
                 f"{self.low / 1e3:g} … {self.high / 1e3:g} kPa."
             )
 
@@ -90,16 +100,16 @@ class Saturation(nn.Module):
 
 
 @cache
-def coefficients() -> tuple[float, float, Float[np.ndarray, "cells 6 5"]]:
+def coefficients(fluid: str) -> tuple[float, float, Float[np.ndarray, "cells 6 5"]]:
     """Least and greatest pressure [Pa], and the coefficients of the spline by cell, power and property."""
     from scipy.interpolate import make_interp_spline  # here, because it takes a second to load
 
-    pressures, *properties = np.loadtxt(DATA, delimiter=",").T
+    pressures, *properties = np.loadtxt(DATA / f"{fluid}.csv", delimiter=",").T
     low, high = float(pressures[0]), float(pressures[-1])
     nodes = np.linspace(math.log(low), math.log(high), CELLS + 1)
     spline = make_interp_spline(nodes, np.stack(properties, -1), k=DEGREE)
     width = (nodes[-1] - nodes[0]) / CELLS
     powers = [spline(nodes[:-1], nu=m) * width**m / math.factorial(m) for m in range(DEGREE + 1)]
     table = np.stack(powers, 1)
-    table.flags.writeable = False  # every tank shares it
+    table.flags.writeable = False  # every tank of this fluid shares it
     return low, high, table
