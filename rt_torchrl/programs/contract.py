@@ -27,8 +27,8 @@ import types
 from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import chain
-from operator import getitem, methodcaller
+from itertools import chain, starmap
+from operator import getitem, is_, methodcaller
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -105,18 +105,15 @@ class Compared:
 
     def note(self) -> None:
         """Let everything be as it is now."""
-        self._entries = [x for x, _ in self.entries], [name for _, name in self.entries]
-        self._parts = [x for x, _ in self.parts], [name for _, name in self.parts]
         self._views = [x.detach() for x in self.tensors]
-        self._then, self._numbers_then = self._objects(), self._numbers()
-        self._addresses = self._then.tobytes()
+        self._then, self._numbers_then = [*self._objects()], self._numbers()
 
-    def _objects(self, count: int = -1) -> np.ndarray:
-        """All objects; as long as the array lives, no other object takes their addresses."""
+    def _objects(self) -> Iterator[object]:
+        """All objects; as long as a list of them lives, no other object takes their addresses."""
         containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
         kinds, dicts = map(type, self.instances), map(vars, self.instances)
-        others = chain(kinds, dicts, map(getitem, *self._entries), map(getattr, *self._parts))
-        return np.fromiter(chain(chain.from_iterable(containers), others), object, count)
+        others = chain(kinds, dicts, starmap(getitem, self.entries), starmap(getattr, self.parts))
+        return chain(chain.from_iterable(containers), others)
 
     def _numbers(self) -> list[object]:
         sizes = map(len, chain(self.mappings, self.sequences, self.classes))
@@ -128,7 +125,7 @@ class Compared:
             return (
                 self._numbers() == self._numbers_then
                 and all(map(Tensor.is_set_to, self.tensors, self._views))
-                and self._objects(len(self._then)).tobytes() == self._addresses
+                and all(map(is_, self._objects(), self._then))
             )
         except (AttributeError, KeyError, ValueError, RuntimeError):  # a value is lost, or a tensor's type is another
             return False
