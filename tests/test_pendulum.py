@@ -111,7 +111,7 @@ def test_mass_and_length_follow_from_a_log_that_passes_the_seam():
     parts, sensors = resample(log, plant), sensors_in(plant, log)
     sides = hold_out(parts.segments, plant.dt, 0.25)
     records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in sides]
-    twin = DigitalTwin(plant, UniformRod.guess(0.9))
+    twin = DigitalTwin(plant, UniformRod([0.9, 0.9]))
     found = identify(Estimation(twin, sensors, config=EstimationConfig(errors="robust")), *records)
     errors = found.estimate.uncertainty.standard_errors()
     for name, value in found.estimate.after.items():

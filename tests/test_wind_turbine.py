@@ -273,7 +273,9 @@ def test_the_pitch_is_the_scheduled_pi_law_by_hand(controller):
 
 
 def nominal(plant):
-    return GainScheduled(plant, detuning=0.0, generator=seeded())
+    policy = GainScheduled(plant, generator=seeded())
+    torch.nn.init.zeros_(policy.weights)
+    return policy
 
 
 def observed(plant, omega, beta, rate=0.0):

@@ -35,15 +35,6 @@ class UniformRod(PositiveCoefficients):
     meanings = {"mass": "mass of the rod", "length": "length of the rod"}
     true_coefficients = (1.0, 1.0)
 
-    @classmethod
-    def guess(cls, share: float) -> "UniformRod":
-        """A rod whose mass and length are both ``share`` times the true ones.
-
-        Raises:
-            ValueError: if ``share`` is not positive and finite.
-        """
-        return cls(share * torch.tensor(cls.true_coefficients, dtype=torch.float64))
-
     def forward(self, features: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         """c_g [1/m] and c_u [1/(kg m²)], the same at every (cos θ, sin θ, dθ/dt)."""
         mass, length = self.coefficients.unbind()
@@ -73,17 +64,13 @@ class Pendulum(Plant):
         dt: control interval [s]; Gymnasium's is 0.05.
         horizon: length of an episode T_o [s]; Gymnasium's is 200 intervals.
         closure: closure for c_g and c_u of the real rod; None for Gymnasium's rod of 1 kg and 1 m.
-        gravity: g [m/s²]; Gymnasium's is 10.
-        guess: share of the true mass and length that the twin starts from.
-
-    Raises:
-        ValueError: if ``gravity`` or ``guess`` is not positive, or is above 1000.
 
     Source: gymnasium, ``classic_control/pendulum.py``.
     """
 
     name = "pendulum"
 
+    gravity = 10.0  # g [m/s²]
     greatest_torque, greatest_speed = 2.0, 8.0  # [N m], [rad/s]
     greatest_initial_speed = 1.0  # [rad/s]
     hidden = (32, 32)
@@ -100,20 +87,8 @@ class Pendulum(Plant):
         Signal(symbol=r"\dot\theta/8", name="scaled_speed", unit="-", low=-1.0, high=1.0),
     )
 
-    def __init__(
-        self,
-        *,
-        dt: float = 0.05,
-        horizon: float = 10.0,
-        closure: nn.Module | None = None,
-        gravity: float = 10.0,
-        guess: float = 0.5,
-    ):
+    def __init__(self, *, dt: float = 0.05, horizon: float = 10.0, closure: nn.Module | None = None):
         super().__init__(dt=dt, horizon=horizon, closure=UniformRod.true() if closure is None else closure)
-        for argument, value in (("gravity", gravity), ("guess", guess)):
-            if not 0.0 < value <= 1000.0:
-                raise ValueError(f"{argument}={value} of the pendulum must be positive and at most 1000.")
-        self.gravity, self.guess = gravity, guess
 
     # The system
 
@@ -184,8 +159,8 @@ class Pendulum(Plant):
         return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64, device=generator.device)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """A rod whose mass and length are ``guess`` times the true ones; nothing is drawn."""
-        return UniformRod.guess(self.guess)
+        """A rod with half of the true mass and length; nothing is drawn."""
+        return UniformRod([0.5 * value for value in UniformRod.true_coefficients])
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """A perceptron, because no affine law of cos θ, sin θ and dθ/dt swings the rod up and also holds it there."""

@@ -1,7 +1,7 @@
 """Gymnasium's ``Pendulum-v1`` itself, in the terms of the plant."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -14,15 +14,12 @@ def angle_and_speed(observation: Tensor) -> Tensor:
     return torch.stack([torch.atan2(sine, cosine), rate], -1)
 
 
-def gymnasium_pendulum(
-    plant: Pendulum, *, seed: int = 0, closure: nn.Module | None = None, device: torch.device | str = "cpu"
-) -> RealSystem:
+def gymnasium_pendulum(plant: Pendulum, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:
     """The real system, which reports in single precision.
 
     Args:
         plant: the plant, with Gymnasium's time step.
         seed: seed of the initial states.
-        closure: closure with Gymnasium's mass and length, if policies are to be judged on the plant; else None.
         device: device of the reported tensors.
 
     Raises:
@@ -36,6 +33,4 @@ def gymnasium_pendulum(
     dt = vars(env.unwrapped)["dt"]
     if dt != plant.dt:
         raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {dt} s.")
-    return RealSystem(
-        GymWrapper(env), plant, state=Reading(of=angle_and_speed), closure=closure, seed=seed, device=device
-    )
+    return RealSystem(GymWrapper(env), plant, state=Reading(of=angle_and_speed), seed=seed, device=device)

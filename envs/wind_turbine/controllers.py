@@ -111,11 +111,10 @@ class GainScheduled(nn.Module):
     Args:
         plant: a turbine whose policies observe speed above rated, speed rate and pitch, as by
             ``observe=("scheduled",)``; other observations are ignored. It gives scales, ranges and control interval.
-        detuning: width of the draw of the first gains, exp(U(−detuning, detuning)) times the nominal gains.
-        generator: source of the detuning.
+        generator: source of the first gains, 1/2 to 2 times the nominal ones.
 
     Raises:
-        ValueError: if the detuning is negative, or the plant does not observe the signals.
+        ValueError: if the plant does not observe the signals.
 
     Source: the regions and constants of Jonkman et al., NREL/TP-500-38060, section 7.
     """
@@ -137,10 +136,8 @@ class GainScheduled(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, plant: WindTurbine, *, detuning: float = math.log(2.0), generator: torch.Generator):
+    def __init__(self, plant: WindTurbine, *, generator: torch.Generator):
         super().__init__()
-        if not detuning >= 0.0:
-            raise ValueError(f"detuning={detuning} of the gains must not be negative.")
         names = [signal.name for signal in plant.observations]
         if not set(self.SEES) <= set(names):
             raise ValueError(
@@ -150,7 +147,7 @@ class GainScheduled(nn.Module):
         self._places = [names.index(name) for name in self.SEES]
         self._names = tuple(self.NOMINAL)
         share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
-        self.weights = nn.Parameter(detuning * (2.0 * share - 1.0))
+        self.weights = nn.Parameter(math.log(2.0) * (2.0 * share - 1.0))
         self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
         low, high = bounds(plant.actions)
         self.register_buffer("low", low)

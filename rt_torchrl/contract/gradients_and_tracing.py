@@ -12,7 +12,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.trajectories.engines.code import IntervalCode, point_of
-from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
+from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval, costate_products
 from rt_torchrl.trajectories.engines.parallel import as_one_batch
 from rt_torchrl.trajectories.twin import jacobians_of
 
@@ -177,10 +177,8 @@ def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[], Te
 def _gradients(measure: Callable[[], Tensor], inputs: list[Tensor]) -> Sequence[Tensor]:
     """The gradients by inputs, which are zero where autograd sees no path."""
     with torch.enable_grad():
-        total = measure().sum()
-        if not total.requires_grad:
-            return [torch.zeros_like(x) for x in inputs]
-        return torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
+        value = measure()
+        return costate_products(value, inputs, torch.ones_like(value))
 
 
 def _verdict(method: str, by: str, slope: Tensor, differences: Tensor) -> Iterator[str]:

@@ -39,7 +39,7 @@ class CSource:
         self._tables: dict[str, str] = {}
         self._weights = weights
 
-    def add(self, head: str, program: Program, inputs: Inputs, outputs: Outputs, *, last: Sequence[str] = ()) -> None:
+    def add(self, head: str, program: Program, inputs: Inputs, outputs: Outputs) -> None:
         """Add a function that reads all its inputs before it writes an output, so that both may be one array.
 
         Args:
@@ -47,7 +47,6 @@ class CSource:
             program: the program.
             inputs: C expression of each input, by name and position.
             outputs: places that are written, in C, with the numbers that they receive.
-            last: statements at its end.
         """
         values = [value for _, value in outputs]
         needed, writer = [program.operations[i] for i in program.needed(values)], CWriter(self._tables)
@@ -55,7 +54,7 @@ class CSource:
         writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
         found = Lowering(program, writer, names, "weights").write(values)
         writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
-        self.write(head, [*writer.lines, *last])
+        self.write(head, writer.lines)
 
     def write(self, head: str, lines: Sequence[str]) -> None:
         """Add a function of given statements."""

@@ -37,7 +37,8 @@ class Trajectory(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
         """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
-        return type(self)(*(change(part) if isinstance(part, Tensor) else part for part in self))
+        changed = {name: change(part) for name, part in self._asdict().items() if isinstance(part, Tensor)}
+        return self._replace(**changed)
 
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
