@@ -39,10 +39,10 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import ROLES, Role, TwinningConfig
+from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.steps.imitation import TWICE, Imitation
+from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Clearance, Interact, RealFlights
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
@@ -139,7 +139,7 @@ class ReinforcementTwinning(TensorDictSequential):
         collector = env if isinstance(env, Operation) else make_collector(env, actor, twin.plant)
         rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
         flights = RealFlights(env, actor, rollout, twin.plant)
-        clearance = Clearance(system, policies, virtual, config.limits)
+        clearance = Clearance(system, policies, belief, config.limits, None if first is None else first.teacher)
         interact = Interact(env, policies, flights, clearance, belief, config, judged)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
@@ -233,6 +233,8 @@ class ReinforcementTwinning(TensorDictSequential):
         for flight in flights:
             self.steps["learn"].store(flight.parts)
             self.short_term.append(flight.record)
+            if self.first.teacher is not None:
+                self.belief.append_first(flight.record, flight.cost.item())
             if on_twin:
                 self.virtual.learn(flight.record)
         if on_twin:
@@ -242,11 +244,6 @@ class ReinforcementTwinning(TensorDictSequential):
                 self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
         found = self.steps["switch"].imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
-        # Of two policies of one architecture, the first alone imitates, and the other takes its weights.
-        ratios = (found[key] for role in ROLES if (key := f"start_cost_ratio_{role}") in found)
-        if self.first.teacher is not None and "model_based" in pupils and next(ratios, 0.0) > TWICE:
-            # Nobody lets the real system fly what the twin says costs twice as much as the controller does.
-            found = merged(found, self._sound(self.steps["plan"], TensorDict({"number": self.episodes_done})))
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
             self.virtual.processes.clear()

@@ -7,8 +7,9 @@ from small_runs import small_run
 from test_algorithm import twinning
 from test_classical import PD
 
-from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig
+from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.trajectories.trajectory import control_cost
 
 GAINS = (0.4, 0.3)
 
@@ -58,15 +59,48 @@ def test_a_harmful_controller_is_not_imitated():
     assert torch.equal(before, found.policies["model_based"].gain)
 
 
-def test_a_policy_that_cannot_imitate_is_planned_before_it_flies(monkeypatch):
-    monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
-    found = begun(planner=PlannerConfig(iterations=20))
+def wild(found):
+    """Policies that make the system diverge slowly."""
     with torch.no_grad():
         for policy in found.policies.values():
             policy.gain.fill_(-1.0)
-    report = found.start()
-    assert report["start_cost_ratio_model_free"] > 2.0 and report["plan_accepted"] == 1.0
-    assert report["J_a_plan"] < 0.6 * report["J_a_plan_before"] and (found.model_based.gain > 0.0).all()
+
+
+def test_the_controller_flies_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):
+    monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
+    found = begun(planner=PlannerConfig(iterations=20))
+    wild(found)
+    report = found.episode()
+    paid = [flight.cost for flight in found.belief.first]
+    assert report["live"] == "first" and paid == [report["start_cost"].item(), report["real_cost"].item()]
+    assert report["exploration"] == 0.0 and not found.belief.flown
+    assert "model_based may not act: it is expected to cost" in report["reason"]
+    # The plan of that episode flies, and the controller again as soon as both policies are as bad as before.
+    assert found.episode()["live"] == "model_based"
+    state = found.state_dict()
+    wild(found)
+    again = found.steps["interact"].clearance.choose("model_based", 3)
+    assert again.role == "first" and again.policy is found.first.teacher
+    other = begun()
+    other.load_state_dict(state)
+    assert [one.cost for one in other.belief.first] == paid
+
+
+def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
+    found = begun()
+    found.start()
+    expected, paid = found.belief.beside_first(found.model_based)
+    (record,) = found.short_term
+    flown = found.twin.control(found.model_based, record.states[:1], record.exogenous[None])
+    cost = control_cost(found.twin.plant, flown).item()
+    assert expected == pytest.approx(cost) and paid == pytest.approx(control_cost(found.twin.plant, record).item())
+
+
+def test_the_twin_alone_knows_no_controller():
+    found = begun(referee=RefereeConfig(rule="decision_tree"))
+    wild(found)
+    found.start()
+    assert found.belief.beside_first(found.model_based) is None
 
 
 def run(folder, **options):

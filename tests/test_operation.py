@@ -11,14 +11,26 @@ import torch
 from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from small_runs import small_run
+from test_classical import PD
 from test_faults import require_true
 
-from rt_torchrl import ExplorationConfig, OperatingLimits, PlantEnv, Reading, RealSystem, RunConfig, SafetyLayer
+from rt_torchrl import (
+    ExplorationConfig,
+    FirstController,
+    OperatingLimits,
+    PlannerConfig,
+    PlantEnv,
+    Reading,
+    RealSystem,
+    RunConfig,
+    SafetyLayer,
+)
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.real_side import learner_threads
+from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.systems import operation as module
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
-from rt_torchrl.systems.operation import Operation, Operator
+from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 
 QUIET = ExplorationConfig(episodes=0)
@@ -313,3 +325,22 @@ def test_what_cannot_operate_is_refused(make_env, continuous, message):
 def test_a_real_system_that_only_the_learner_has_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"give Run\(..., env=\) a function that makes it"):
         small_run(tmp_path, plant=PLANT, parts={"env": machine()}, asynchronous=True)
+
+
+def test_the_first_controller_goes_on_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):
+    monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
+    plant, controller = LinearQuadratic(horizon=2.0), PD(LinearQuadratic(horizon=2.0), (0.4, 0.3))
+    found = twinning(
+        lambda plant, policies, exploration: InProcess(
+            plant, {FIRST: controller, **policies}, exploration, Stepped(plant)
+        ),
+        plant,
+        first=FirstController(controller),
+        planner=PlannerConfig(iterations=0, starts=0),
+    )
+    with torch.no_grad():
+        for policy in found.policies.values():
+            policy.gain.fill_(-1.0)
+    reports = [found.episode() for _ in range(2)]
+    assert [report["live"] for report in reports] == [FIRST, FIRST] and not found.belief.flown
+    assert [float(report["version"]) for report in reports] == [1.0, 2.0] and len(found.belief.first) == 3

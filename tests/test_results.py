@@ -21,7 +21,7 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.metrics import read_metrics
-from rt_torchrl.runs.results import closure_lines, fit_lines, next_steps, results_table
+from rt_torchrl.runs.results import closure_lines, dearer_than_first, fit_lines, next_steps, results_table
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
 
@@ -197,6 +197,12 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     assert "recipes/export.py" in said(live, 2.0 * cost)
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
+    first = {"expected": 3.0, "paid": 2.0}
+    assert "the controller that flew first is better than the live policy" in said(live, 2.0 * cost, first=first)
+    assert "recipes/export.py" in said(live, 2.0 * cost, first={"expected": 2.0, "paid": 3.0})
+    assert dearer_than_first({"first": first | {"expected": None}}).startswith(
+        "the live policy is expected to cost - on"
+    )
     assert said("model_free", math.inf, live="model_free").endswith("--role model_free")
     planned = said("model_based", math.inf, "receding_horizon", live="model_based")
     assert planned.endswith("--what twin")

@@ -89,13 +89,15 @@ def summarise(
 
     Every ratio is a cost on the unseen episodes after training over the same cost before. J_p before and after belong
     to the same episodes, which the final live policy has flown. What is said of the twin is said of the one that is
-    most likely to be right; ``believed`` names its hypothesis, and is None where it is the twin alone.
+    most likely to be right; ``believed`` names its hypothesis, and is None where it is the twin alone. ``first`` says
+    what the live policy is ``expected`` to cost where the controller that flew first ``paid`` so much; None without.
     """
     closure, live = algorithm.twin.believed_law, algorithm.referee.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = of_each_role(initial_policies, unseen.control_costs)
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
     after = {role: judged[role].control_costs.mean().item() for role in ROLES}
+    first = algorithm.belief.beside_first(algorithm.policies[live])
     means = {"J_p": J_p, "J_p_before": J_p_before}
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     return {
@@ -106,6 +108,7 @@ def summarise(
         | results(judged),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
+        "first": None if first is None else dict(zip(("expected", "paid"), first, strict=True)),
         "better": better_of(algorithm, unseen),
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
@@ -291,6 +294,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         f"  live at the end: {found['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
         f"{paid['episodes']} episodes{judging}, largest {most}"
     )
+    lines += [f"  {sentence}" for sentence in [dearer_than_first(found)] if sentence]
     lines += hypothesis_lines(found["hypotheses"], found["believed"])
     lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
@@ -410,6 +414,18 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     return [f"  {about}", *last]
 
 
+def dearer_than_first(summary: Mapping[str, Any]) -> str:
+    """That the controller that flew first is expected to cost less than the live policy; empty if it is not."""
+    first = summary["first"]
+    if first is None or (first["expected"] is not None and first["expected"] <= first["paid"]):
+        return ""
+    expected = _number(first["expected"], ".4g")
+    return (
+        f"the live policy is expected to cost {expected} on the real system, where the controller that flew first paid "
+        f"{first['paid']:.4g}"
+    )
+
+
 def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
@@ -427,9 +443,10 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
-    elif best is not None and cost >= known[best]:
+    elif (best is not None and cost >= known[best]) or dearer_than_first(found):
+        better = best if best is not None and cost >= known[best] else "the controller that flew first"
         longer = "go on with --resume and more --episodes, or train with more --twinning.planner.iterations"
-        steps.append(f"{best} is better than the live policy: keep it, {longer}")
+        steps.append(f"{better} is better than the live policy: keep it, {longer}")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
     elif not alone:

@@ -76,6 +76,13 @@ class Flown(NamedTuple):
     exploration: float = 0.0
 
 
+class FirstFlown(NamedTuple):
+    """A real episode of the controller that flew first: its trajectory, and its J_a."""
+
+    trajectory: Trajectory
+    cost: float
+
+
 class Judged(NamedTuple):
     """What a policy costs; the smaller one is the better one.
 
@@ -109,6 +116,8 @@ class Belief:
         self.virtual, self.corrects = virtual, corrects
         self._policies = policies
         self.flown: list[Flown] = []
+        self.first: list[FirstFlown] = []
+        """The latest episodes of the controller that flew first."""
         self._costs: tuple[Any, list[float]] | None = None
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
@@ -138,6 +147,23 @@ class Belief:
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
         self._costs = self._anchored = None
+
+    def append_first(self, trajectory: Trajectory, cost: float) -> None:
+        """Add an episode that the controller has flown with which the training has begun."""
+        self.first = [*self.first, FirstFlown(trajectory, cost)][-ANCHORS:]
+
+    @torch.no_grad()
+    def beside_first(self, policy: nn.Module) -> tuple[float, float] | None:
+        """The cost that is expected of a policy in the episodes of the controller that flew first, and what these cost.
+
+        None where no controller flew first, the twin alone has the word, or the policy is state feedback, which plans
+        on the twin while it acts.
+        """
+        if not (self.corrects and self.first) or isinstance(policy, StateFeedback):
+            return None
+        costs = [self.virtual.cost(policy, self.virtual.repeated(one.trajectory)) for one in self.first]
+        paid = [one.cost for one in self.first]
+        return self.expected(policy, sum(costs) / len(costs)), sum(paid) / len(paid)
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it, until the next call for this role.
@@ -367,10 +393,15 @@ class Belief:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        return {"flown": [one._asdict() | {"trajectory": one.trajectory._asdict()} for one in self.flown]}
+        flown: dict[str, Sequence[Flown | FirstFlown]] = {"flown": self.flown, "first": self.first}
+        return {
+            name: [one._asdict() | {"trajectory": one.trajectory._asdict()} for one in episodes]
+            for name, episodes in flown.items()
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
+        self.first = [FirstFlown(Trajectory(**one["trajectory"]), one["cost"]) for one in state["first"]]
         self._costs = self._anchored = None
 
 

@@ -14,8 +14,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig, other_than
-from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.report import Step, findings, merged, plain
+from rt_torchrl.steps.report import Step, findings, in_words, merged, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, Order
@@ -47,6 +46,10 @@ class ShortTermMemory(deque[Trajectory]):
 
 LEAST_SOUND = 0.5
 """Least share of a real episode in one sound part, below which it is flown again."""
+TWICE = 2.0
+"""Cost that is expected of a policy over that of the controller that flew first, beyond which the policy is not tried.
+
+A policy that costs less shows how the real system answers other actions, without which plans do not improve."""
 FLIGHTS = 3
 """Number of real episodes in a row without a sound part after which somebody has to look at the machine."""
 
@@ -219,73 +222,96 @@ def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
 
 
 class Cleared(NamedTuple):
-    """The policy that may act, the role whose weights it has, and the report of the check."""
+    """What may act, the role whose weights it has or ``first``, and the report of the check."""
 
     policy: nn.Module
-    role: Role
+    role: str
     report: TensorDict
 
 
 class Clearance:
-    """Lets a policy act only if the twin predicts that it keeps the limits.
+    """Lets a policy act only if it is expected to keep the limits, and not to cost twice what flew first.
 
-    The live policy is asked first, then the idle one, then the weights that were cleared last. Before the first real
-    episode there are no virtual episodes, and the live policy acts unchecked, behind the safety layer.
+    The live policy is asked first, then the idle one. Where neither may act, the controller does with which the
+    training has begun, or without one the weights that were cleared last. Before the first real episode nothing is
+    known, and the live policy acts unchecked, behind the safety layer.
 
     Args:
         env: the real system, which needs a safety layer if there are limits.
         policies: both policies by role.
-        virtual: virtual episodes.
+        belief: what policies cost, and the virtual episodes.
         config: the limits.
+        controller: what the training has begun with; None without.
 
     Raises:
         ValueError: if the plant has no such limits, see :class:`OperatingLimits`, or the real system no safety layer.
     """
 
     def __init__(
-        self, env: EnvBase, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, config: OperatingLimitsConfig
+        self,
+        env: EnvBase,
+        policies: Mapping[Role, nn.Module],
+        belief: Belief,
+        config: OperatingLimitsConfig,
+        controller: nn.Module | None = None,
     ):
         self.limited = bool(config)
         if self.limited:
             require_layer(env)
-        self.policies, self.virtual, self.config = policies, virtual, config
-        self.limits = OperatingLimits(virtual.twin.plant, config)
+        self.policies, self.belief, self.virtual = policies, belief, belief.virtual
+        self.limits, self.controller = OperatingLimits(belief.virtual.twin.plant, config), controller
         self._last: dict[str, Any] | None = None
         """The role and weights that were cleared last."""
 
     @torch.no_grad()
     def choose(self, live: Role, count: int) -> Cleared:
-        """The policy that may act.
+        """What may act.
 
         Args:
             live: role that the referee wants to act.
             count: number of virtual episodes of the check.
 
         Returns:
-            The policy. The report holds ``predicted_violations``, its share of control intervals beyond a limit, and a
-            reason for each policy that is refused.
+            What may act. The report holds a reason for each policy that is refused and, with limits,
+            ``predicted_violations``, the share of control intervals beyond one.
 
         Raises:
-            ValueError: if no policy may act.
+            ValueError: if nothing may act.
         """
-        if not self.limited or not self.virtual.processes:
-            return Cleared(self.policies[live], live, findings())
-        episodes, reasons = self.virtual.draw(count), list[str]()
+        episodes = self.virtual.draw(count) if self.limited and self.virtual.processes else None
+        refused = list[str]()
         for role in (live, other_than(live)):
-            share = self.predicted(self.policies[role], episodes)
-            if share == 0.0:
-                self._last = {"role": role, "weights": copy.deepcopy(self.policies[role].state_dict())}
-                return Cleared(self.policies[role], role, findings(*reasons, predicted_violations=share))
-            reasons.append(f"{role} may not act: it would leave the limits in {100.0 * share:.3g} % of the intervals")
+            policy, share = self.policies[role], 0.0
+            if episodes is not None:
+                share = self.predicted(policy, episodes)
+            left = f"it would leave the limits in {100.0 * share:.3g} % of the intervals"
+            reason = left if share > 0.0 else self._dearer(policy)
+            if not reason and episodes is None:
+                return Cleared(policy, role, findings(*refused))
+            if not reason:
+                self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
+                return Cleared(policy, role, findings(*refused, predicted_violations=share))
+            refused.append(f"{role} may not act: {reason}")
+        if self.controller is not None:
+            return Cleared(self.controller, FIRST, findings(*refused))
         if self._last is None:
             raise ValueError(
-                f"no policy may act. {'; '.join(reasons)}. Widen the limits, or begin with something that keeps them, "
+                f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, "
                 "such as --start controller."
             )
-        role = self._last["role"]
-        policy = copy.deepcopy(self.policies[role])
+        role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
         policy.load_state_dict(self._last["weights"])
-        return Cleared(policy, role, findings(*reasons, predicted_violations=self.predicted(policy, episodes)))
+        assert episodes is not None  # without limits, only the controller's costs refuse a policy
+        share = self.predicted(policy, episodes)
+        return Cleared(policy, role, findings(*refused, predicted_violations=share))
+
+    def _dearer(self, policy: nn.Module) -> str:
+        """Why a policy is too dear to be tried beside the controller that flew first; empty if it is not."""
+        known = None if self.controller is None else self.belief.beside_first(policy)
+        if known is None or known[0] <= TWICE * known[1]:
+            return ""
+        expected, paid = map(in_words, known)
+        return f"it is expected to cost {expected} where the controller that flew first cost {paid}"
 
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
         """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
@@ -334,9 +360,9 @@ class Operating:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        policy, role, report = self.step.clearance.choose(role, self.step.judged)
-        strength = self._exploration.strength(episode)
-        self.operation.hand_over(role, policy, strength=strength, found=plain(report))
+        policy, name, report = self.step.clearance.choose(role, self.step.judged)
+        strength = 0.0 if name == FIRST else self._exploration.strength(episode)
+        self.operation.hand_over(name, policy, strength=strength, found=plain(report))
 
     def take(self, live: Role, episode: int) -> tuple[Sequence[Flight], TensorDict]:
         """Take every window that has come in; wait until one is of a policy.
@@ -358,7 +384,7 @@ class Operating:
             flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=self.step.wanting)
             flights.append(flight)
             order = self._order_of(flight)
-            policy_flew |= order.name != FIRST
+            policy_flew |= order.version > 0 or order.name != FIRST
             self.step.keep(flight, order.name, order.strength, order.weights)
         return flights, self._report(flights)
 
@@ -435,7 +461,7 @@ class Interact(Step):
     def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
         """One episode of the policy that may act, the live one if it is cleared."""
         cleared = self.clearance.choose(live, self.judged)
-        acting, strength = cleared.policy, self.config.exploration.strength(number)
+        acting, strength = cleared.policy, 0.0 if cleared.role == FIRST else self.config.exploration.strength(number)
         flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
         self.keep(flight, cleared.role, self.flights.actor.strength, acting.state_dict())
         report = merged(report_of_flights([flight]), findings(exploration=self.flights.actor.strength))
@@ -444,8 +470,12 @@ class Interact(Step):
         return [flight], report.set_non_tensor("live", cleared.role)
 
     def keep(self, flight: Flight, pilot: str, strength: float, weights: Mapping[str, Tensor]) -> None:
-        """Remember the record of a flight and, if it is one of a whole episode by a policy, what it cost."""
+        """Remember the record of a flight and, if it is one of a whole episode, what it cost."""
         self.short_term.append(flight.record)
-        if flight.whole and pilot != FIRST:  # costs of parts cannot be compared with those of episodes
+        if not flight.whole:  # costs of parts cannot be compared with those of episodes
+            return
+        if pilot == FIRST:
+            self.belief.append_first(flight.record, flight.cost.item())
+        else:
             explored = strength * self.config.exploration.spread
             self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), explored, weights)
