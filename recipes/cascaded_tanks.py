@@ -5,26 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from rt_torchrl import (
-    DigitalTwin,
-    Estimate,
-    Estimation,
-    EstimationConfig,
-    SensorRecord,
-    configuration,
-    main_of,
-    sensors_of,
-)
 from rt_torchrl.atomic_file import make_folder, write_json
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
@@ -43,7 +33,7 @@ UPPER_LEVEL = 20.0
 """First guess of the upper level, which has no sensor [V]."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Identify the Cascaded Tanks benchmark: physics, and physics with a perceptron.
 
@@ -66,22 +56,22 @@ class Config:
     test: bool = False
     log_dir: Path = Path("runs/cascaded_tanks")
 
-    def estimation(self, closure: nn.Module, **options: Any) -> Estimation:
+    def estimation(self, closure: nn.Module, **options: Any) -> rt.Estimation:
         """The estimation of a closure of the tanks from the lower level."""
-        plant, config = CascadedTanks(), EstimationConfig(iterations=self.iterations, errors="robust", **options)
-        return Estimation(DigitalTwin(plant, closure), sensors_of(plant, ["sensed_level"]), config=config)
+        plant, config = CascadedTanks(), rt.EstimationConfig(iterations=self.iterations, errors="robust", **options)
+        return rt.Estimation(rt.DigitalTwin(plant, closure), rt.sensors_of(plant, ["sensed_level"]), config=config)
 
 
-Found = tuple[Estimation, Estimate]
+Found = tuple[rt.Estimation, rt.Estimate]
 
 
-def physics(records: list[SensorRecord], config: Config) -> Found:
+def physics(records: list[rt.SensorRecord], config: Config) -> Found:
     """The physics, identified from records."""
     estimation = config.estimation(CascadedTanks().make_closure(torch.Generator()), starts=config.starts)
     return estimation, estimation.run(records)
 
 
-def with_perceptron(law: nn.Module, records: list[SensorRecord], prior: float, config: Config) -> Found:
+def with_perceptron(law: nn.Module, records: list[rt.SensorRecord], prior: float, config: Config) -> Found:
     """The physics with a perceptron, which starts from an identified law."""
     assert isinstance(law, Hydraulics)
     start, generator = Hydraulics(law.coefficients.detach()), torch.Generator().manual_seed(0)
@@ -90,7 +80,9 @@ def with_perceptron(law: nn.Module, records: list[SensorRecord], prior: float, c
     return estimation, estimation.run(records)
 
 
-def simulated(estimation: Estimation, estimate: Estimate, record: SensorRecord, *, first: int = FIRST) -> Tensor:
+def simulated(
+    estimation: rt.Estimation, estimate: rt.Estimate, record: rt.SensorRecord, *, first: int = FIRST
+) -> Tensor:
     """The readings along a record by an identified twin, from a start that the first samples tell."""
     readings, noise = record.readings.clone(), estimate.likelihood.noise
     readings[first:] = torch.nan
@@ -99,19 +91,19 @@ def simulated(estimation: Estimation, estimate: Estimate, record: SensorRecord, 
     return whole.simulated()[0]
 
 
-def folds_of(record: SensorRecord, count: int) -> Iterator[tuple[list[SensorRecord], SensorRecord]]:
+def folds_of(record: rt.SensorRecord, count: int) -> Iterator[tuple[list[rt.SensorRecord], rt.SensorRecord]]:
     """Parts of a record of equal length: what is left of the record without the part, and the part itself."""
     n, dt = len(record.actions), CascadedTanks().dt
     cuts = [round(k * n / count) for k in range(count + 1)]
 
-    def part(first: int, last: int) -> SensorRecord:
+    def part(first: int, last: int) -> rt.SensorRecord:
         return record.part(first, last, dt)._replace(guess=guess(record.readings[first]))
 
     for first, last in itertools.pairwise(cuts):
         yield [part(*ends) for ends in ((0, first), (last, n)) if ends[1] > ends[0]], part(first, last)
 
 
-def cross_validated(record: SensorRecord, config: Config) -> dict[str, float]:
+def cross_validated(record: rt.SensorRecord, config: Config) -> dict[str, float]:
     """RMS error over all parts of a record by twins of the other parts, of the physics and with every prior [V]."""
     squares: dict[str, list[Tensor]] = {}
     for training, held_out in folds_of(record, config.folds):
@@ -127,13 +119,13 @@ def guess(readings: Tensor) -> Tensor:
     return torch.cat([readings.new_tensor([UPPER_LEVEL]), readings])
 
 
-def sensor_record_of(voltage: np.ndarray, level: np.ndarray) -> SensorRecord:
+def sensor_record_of(voltage: np.ndarray, level: np.ndarray) -> rt.SensorRecord:
     """A record of the benchmark; the voltage of the last sample acts on nothing."""
     readings, actions = torch.tensor(level).double()[:, None], torch.tensor(voltage).double()[:-1, None]
-    return SensorRecord(readings, actions, torch.zeros_like(actions), guess(readings[0]))
+    return rt.SensorRecord(readings, actions, torch.zeros_like(actions), guess(readings[0]))
 
 
-def level_figure(record: SensorRecord, readings: Tensor, title: str) -> "Figure":
+def level_figure(record: rt.SensorRecord, readings: Tensor, title: str) -> "Figure":
     """The level over time, as measured and as simulated, and the errors below."""
     from rt_torchrl.figures.style import REAL, TWIN, array, caption, grid, legend_below
 
@@ -180,4 +172,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -2,62 +2,39 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 from torch import nn
 
-from rt_torchrl import (
-    PAPER,
-    AssimilationConfig,
-    DescentConfig,
-    ExogenousConfig,
-    ExplorationConfig,
-    HypothesesConfig,
-    LearnerConfig,
-    PlannerConfig,
-    Plant,
-    PredictiveConfig,
-    Preset,
-    RefereeConfig,
-    RunConfig,
-    TwinningConfig,
-    main_of,
-)
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from rt_torchrl import Snapshot
-
 # Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
-LOAD = ExogenousConfig(knots=1440)
-LBFGS = DescentConfig(optimiser="lbfgs", rate=1.0)
+LOAD = rt.ExogenousConfig(knots=1440)
+LBFGS = rt.DescentConfig(optimiser="lbfgs", rate=1.0)
 PAPER_T3 = dataclasses.replace(
-    PAPER,
+    rt.PAPER,
     realisations=1,
-    learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
+    learner=dataclasses.replace(rt.PAPER.learner, critic_iterations=1000, discount=0.998),
     exogenous=LOAD,
-    assimilation=dataclasses.replace(PAPER.assimilation, iterations=30),
-    planner=dataclasses.replace(PAPER.planner, iterations=5, descent=LBFGS),
-    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
+    assimilation=dataclasses.replace(rt.PAPER.assimilation, iterations=30),
+    planner=dataclasses.replace(rt.PAPER.planner, iterations=5, descent=LBFGS),
+    referee=rt.RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
 )
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T3."""
-DEFAULT = TwinningConfig(
+DEFAULT = rt.TwinningConfig(
     realisations=1,
     # The pressure moves over days: the noise lasts a period of the load, returns span 17 h and the discount 42 h.
-    exploration=ExplorationConfig(correlation_time=5400.0),
-    learner=LearnerConfig(
+    exploration=rt.ExplorationConfig(correlation_time=5400.0),
+    learner=rt.LearnerConfig(
         critic_iterations=100,  # beside a twin they end where the paper's 1000 end
         actor_iterations=100,
         discount=0.9998,
@@ -67,25 +44,25 @@ DEFAULT = TwinningConfig(
     ),
     exogenous=LOAD,
     # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
-    assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
+    assimilation=rt.AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
     # Starting pressures differ by 25 kPa: a plan for one of them does not suit the others.
-    planner=PlannerConfig(
+    planner=rt.PlannerConfig(
         iterations=12,
         realisations=20,
         descent=dataclasses.replace(LBFGS, tolerance=1e-6),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
-        receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
+        receding_horizon=rt.PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
     ),
-    referee=RefereeConfig(patience=4, clone_patience=20),
+    referee=rt.RefereeConfig(patience=4, clone_patience=20),
 )
 """Configuration of the training by default, whose plans converge."""
 NEURAL = dataclasses.replace(
     DEFAULT,
     # Segments last two hours. Without the prior the perceptron takes the first steps, which the constants should take.
-    assimilation=AssimilationConfig(
+    assimilation=rt.AssimilationConfig(
         iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
     ),
-    hypotheses=HypothesesConfig(which=("none",)),
+    hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 
@@ -93,8 +70,8 @@ VALVES = {"on-off": OnOffValve, "PI": PIValve}
 """Classical controllers that the policies are compared with."""
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
     Args:
@@ -130,7 +107,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
-    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
+    twinning: rt.TwinningConfig = DEFAULT
 
     def __post_init__(self):
         super().__post_init__()
@@ -146,7 +123,7 @@ class Config(RunConfig):
                 "no plans of a half-open valve, whose cost has many minima. Use command duty."
             )
 
-    def presets(self) -> dict[Preset, dict[str, Any]]:
+    def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         presets = super().presets() | {
             "default": {"twinning": DEFAULT},
             "paper": {"start": "random", "command": "drop", "end_weight": 0.0, "twinning": PAPER_T3},
@@ -160,7 +137,7 @@ class Config(RunConfig):
                 presets[preset]["twinning"] = dataclasses.replace(twinning, assimilation=estimated)
         return presets
 
-    def plant(self) -> Plant:
+    def plant(self) -> rt.Plant:
         return unknown(self.tank(), self.unknown)
 
     def believed(self) -> CryogenicTank | None:
@@ -195,7 +172,7 @@ class Config(RunConfig):
 
         return fouled
 
-    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+    def plant_figures(self, snapshot):
         from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib
 
         return figures.figures_of(snapshot)
@@ -203,10 +180,9 @@ class Config(RunConfig):
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    Run(config, config.plant(), baselines=VALVES, first=PIValve, **parts).train()
+    rt.Run(config, config.plant(), baselines=VALVES, first=PIValve, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -4,34 +4,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 from tyro.conf import Positional
 
-from rt_torchrl import (
-    LoadedRun,
-    StateFeedback,
-    configuration,
-    export_c,
-    export_controller,
-    export_discon,
-    export_onnx,
-    export_program,
-    export_twin,
-    load_run,
-    main_of,
-)
 from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
 from rt_torchrl.options import Text
 
 FORMATS: dict[str, dict[str, Callable[..., float | None]]] = {
-    "policy": {"c": export_c, "onnx": export_onnx, "pt2": export_program},
-    "controller": {"c": export_controller, "discon": export_discon},
-    "twin": {"c": export_twin},
+    "policy": {"c": rt.export_c, "onnx": rt.export_onnx, "pt2": rt.export_program},
+    "controller": {"c": rt.export_controller, "discon": rt.export_discon},
+    "twin": {"c": rt.export_twin},
 }
 """What writes each thing in each format."""
 KINDS = tuple(dict.fromkeys(kind for kinds in FORMATS.values() for kind in kinds))
@@ -40,7 +27,7 @@ SIZES = {"policy": "actions' ranges", "controller": "actions' ranges", "twin": "
 """What differences are shares of."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Export a trained policy; every file is compared with what it is made of before it is written.
 
@@ -91,9 +78,9 @@ def main(config: Config) -> None:
     formats = config.formats or DEFAULT
     if "onnx" in formats:
         require_packages(ONNX_PACKAGES)
-    run = load_run(config.run, config.recipe)
+    run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
-    if isinstance(policy, StateFeedback) and {"policy", "controller"} & set(config.what):
+    if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):
         name = run.twin.hypothesis
         model = "the model that it plans on" if name is None else f"the twin with {name}, on which it does not plan"
         raise ValueError(
@@ -109,7 +96,7 @@ def main(config: Config) -> None:
                 print(written(config, run, output, what, kind))
 
 
-def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) -> str:
+def written(config: Config, run: rt.LoadedRun, output: Path, what: str, kind: str) -> str:
     """Write one file, and say how it agrees."""
     plant, beside = run.physics, None
     part, file = run.policy(config.role), config.name or f"{run.plant.name}_{config.role}"
@@ -125,4 +112,4 @@ def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) 
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

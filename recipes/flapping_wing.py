@@ -1,65 +1,45 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
-from dataclasses import field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
-from rt_torchrl import (
-    PAPER,
-    AssimilationConfig,
-    DescentConfig,
-    ExogenousConfig,
-    ExplorationConfig,
-    HypothesesConfig,
-    LearnerConfig,
-    PlannerConfig,
-    Plant,
-    PredictiveConfig,
-    Preset,
-    RefereeConfig,
-    RunConfig,
-    TwinningConfig,
-    main_of,
-)
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from rt_torchrl import Snapshot
-
 # Commands of a tenth of a beat; a plan is made twice a beat. A flight with plans of 1 s costs 0.1 % more than one with
 # plans of 1.5 s.
-PREDICTIVE = PredictiveConfig(horizon=1.5, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
+PREDICTIVE = rt.PredictiveConfig(horizon=1.5, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
 """Model predictive control with ``--twinning.planner.method receding_horizon``."""
 
 # The gust is smooth over its 3 s, and the residual of a regression would be taken for drag: with a kernel of 0.3 s and
 # a tube of 2e-4 the residual is 1e-4 m/s.
-GUST = ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3)
+GUST = rt.ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3)
 PAPER_T2 = dataclasses.replace(
-    PAPER,
-    learner=dataclasses.replace(PAPER.learner, critic_iterations=1000, discount=0.998),
+    rt.PAPER,
+    learner=dataclasses.replace(rt.PAPER.learner, critic_iterations=1000, discount=0.998),
     exogenous=GUST,
-    assimilation=dataclasses.replace(PAPER.assimilation, stop_below=1e-2),
+    assimilation=dataclasses.replace(rt.PAPER.assimilation, stop_below=1e-2),
     planner=dataclasses.replace(
-        PAPER.planner, iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
+        rt.PAPER.planner,
+        iterations=5,
+        descent=rt.DescentConfig(rate=0.2, gradient_limit=0.5),
+        receding_horizon=PREDICTIVE,
     ),
-    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=4),
+    referee=rt.RefereeConfig(rule="decision_tree", patience=4, clone_patience=4),
 )
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T2."""
-DEFAULT = TwinningConfig(
+DEFAULT = rt.TwinningConfig(
     # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
     # discount one second. With a discount of 0.998 and targets of one interval the policy flies off.
-    exploration=ExplorationConfig(correlation_time=0.05),
-    learner=LearnerConfig(
+    exploration=rt.ExplorationConfig(correlation_time=0.05),
+    learner=rt.LearnerConfig(
         critic_iterations=100,  # beside a twin they end where the paper's 1000 end
         actor_iterations=100,
         discount=0.9995,
@@ -69,15 +49,15 @@ DEFAULT = TwinningConfig(
     ),
     # Twenty flights hardly meet the rare gusts that cost most, and a plan on those that were met is too mild.
     exogenous=dataclasses.replace(GUST, large_scale="mixed"),
-    assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
+    assimilation=rt.AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     # A valley of the cost is narrow where the stroke plane tilts fast: Adam leaves 1 to 2 % there.
-    planner=PlannerConfig(
+    planner=rt.PlannerConfig(
         iterations=30,
         realisations=20,
-        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
+        descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PREDICTIVE,
     ),
-    referee=RefereeConfig(patience=4, clone_patience=4),
+    referee=rt.RefereeConfig(patience=4, clone_patience=4),
 )
 """Configuration of the training by default."""
 HOP = dataclasses.replace(
@@ -94,10 +74,10 @@ NEURAL = dataclasses.replace(
     DEFAULT,
     # Segments last five wing beats, 0.25 s, because over whole flights most steps fail. They use the measured wind,
     # because three hundred weights on every draw of the wind would take gigabytes.
-    assimilation=AssimilationConfig(
+    assimilation=rt.AssimilationConfig(
         iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
     ),
-    hypotheses=HypothesesConfig(which=("none",)),
+    hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 
@@ -110,8 +90,8 @@ TARGETS = {"paper": (5.0, 5.0), "hop": (1.0, 1.0)}
 """Target (x_f, z_f) of each task [m]."""
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
@@ -138,7 +118,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
-    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
+    twinning: rt.TwinningConfig = DEFAULT
 
     def __post_init__(self):
         super().__post_init__()
@@ -148,14 +128,14 @@ class Config(RunConfig):
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
 
-    def presets(self) -> dict[Preset, dict[str, Any]]:
+    def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         return super().presets() | {
             "default": {"twinning": HOP if self.task == "hop" else DEFAULT},
             "paper": {"policy": "paper", "start": "random", "twinning": PAPER_T2},
             "neural": {"closure": "mlp", "twinning": NEURAL},
         }
 
-    def plant(self) -> Plant:
+    def plant(self) -> rt.Plant:
         return unknown(self.drone(MASS), self.unknown)
 
     def drone(self, mass: float) -> FlappingWing:
@@ -174,7 +154,7 @@ class Config(RunConfig):
             return self.drone(MASS)
         return self.drone(BELIEVED) if self.model_error else None
 
-    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+    def plant_figures(self, snapshot):
         from rt_torchrl.envs.flapping_wing import figures  # here, because an episode need not wait for Matplotlib
 
         return figures.figures_of(snapshot)
@@ -182,10 +162,9 @@ class Config(RunConfig):
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    Run(config, config.plant(), baselines={"PD": TrimmedPD}, first=TrimmedPD, **parts).train()
+    rt.Run(config, config.plant(), baselines={"PD": TrimmedPD}, first=TrimmedPD, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 from tensordict import TensorDictBase
@@ -21,17 +21,6 @@ from torch.nn.utils import parameters_to_vector
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss
 
-from rt_torchrl import (
-    ActorCritic,
-    DescentConfig,
-    DigitalTwin,
-    LearnerConfig,
-    Plant,
-    PlantEnv,
-    RunConfig,
-    identification_cost,
-    main_of,
-)
 from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
@@ -57,7 +46,7 @@ class Config:
     episodes: int = 20
 
 
-def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
+def twinning(options: rt.RunConfig) -> Iterator[dict[str, float | str]]:
     """Train a twin and two policies; after each episode the costs and the decision.
 
     Args:
@@ -68,11 +57,11 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
     policies = options.make_policies(plant, generator)  # l. 1
     live, idle = "model_free", "model_based"
     closure = options.make_closure(plant, generator)  # l. 3
-    twin = DigitalTwin(plant, closure)
+    twin = rt.DigitalTwin(plant, closure)
     learner = DDPG(plant, policies["model_free"], table.learner, generator)  # l. 2, with D_L of l. 4
-    fit, plan = Descent(closure, DescentConfig()), Descent(policies["model_based"], table.planner.descent)
+    fit, plan = Descent(closure, rt.DescentConfig()), Descent(policies["model_based"], table.planner.descent)
     acting = LivePolicy(plant, policies[live], table.exploration, generator=generator)
-    collector = collector_of(PlantEnv(plant, seed=options.seed), acting, plant)
+    collector = collector_of(rt.PlantEnv(plant, seed=options.seed), acting, plant)
     worse, stalled = 0, 0  # C_π and C_w of l. 5
     inputs = plant.acting_inputs
 
@@ -100,7 +89,7 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
         real, actions = (part.expand(len(z), -1, -1) for part in (states, flown["action"]))
 
         def J_p(z: Tensor = z, real: Tensor = real, actions: Tensor = actions) -> Tensor:
-            return identification_cost(plant, twin.replay(real[:, 0], z, actions), real).mean()
+            return rt.identification_cost(plant, twin.replay(real[:, 0], z, actions), real).mean()
 
         assimilated = fit.run(J_p, table.assimilation.iterations, stop_below=table.assimilation.stop_below)
 
@@ -146,11 +135,11 @@ def twinning(options: RunConfig) -> Iterator[dict[str, float | str]]:
 class DDPG:
     """π_mf, its critic q and the memory D_L; line 17 has no target network, and relaxes the critic itself."""
 
-    def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, generator: torch.Generator):
+    def __init__(self, plant: rt.Plant, policy: nn.Module, config: rt.LearnerConfig, generator: torch.Generator):
         self.config, self.memory = config, LongTermMemory(correction=0.0, generator=generator)
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.actor = ScaledPolicy(plant, policy, stochastic=False, device=generator.device)
-        widths = (len(plant.observations) + len(plant.actions), *ActorCritic.critic_hidden)
+        widths = (len(plant.observations) + len(plant.actions), *rt.ActorCritic.critic_hidden)
         self.critic = Critic(widths, generator=generator)
         self.loss = DDPGLoss(
             TensorDictModule(self.actor, ["observation"], ["action"]),
@@ -162,7 +151,7 @@ class DDPG:
         named = [(name, weight) for name, weight in self.loss.named_parameters() if weight.requires_grad]
         self.w_q = [weight for name, weight in named if "value_network" in name]
         self.w_a = [weight for name, weight in named if "value_network" not in name]
-        self.critic_adam = torch.optim.Adam(self.w_q, ActorCritic.critic_rate, fused=True)
+        self.critic_adam = torch.optim.Adam(self.w_q, rt.ActorCritic.critic_rate, fused=True)
         self.restart()
 
     def restart(self) -> None:
@@ -217,4 +206,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

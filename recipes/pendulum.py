@@ -1,42 +1,31 @@
 """Reinforcement twinning of Gymnasium's pendulum, a real system that is not this library's own."""
 
 import dataclasses
-from dataclasses import field
 from functools import partial
 from typing import Any
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
-from rt_torchrl import (
-    AssimilationConfig,
-    ExplorationConfig,
-    LearnerConfig,
-    PlannerConfig,
-    RunConfig,
-    TwinningConfig,
-    main_of,
-    require_device,
-)
 from rt_torchrl.envs.pendulum.plant import Pendulum
 
-SWING_UP = TwinningConfig(
+SWING_UP = rt.TwinningConfig(
     # The model-free policy finds the swing-up and plans improve it, because descents from random weights end in another
     # minimum. White noise hardly moves the rod; this one fills the torque's range and lasts about a swing.
-    exploration=ExplorationConfig(spread=1.0, episodes=10, correlation_time=0.3),
+    exploration=rt.ExplorationConfig(spread=1.0, episodes=10, correlation_time=0.3),
     # Costs reach 16; the scale keeps values at the order of ten, which a perceptron can reach.
-    learner=LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
+    learner=rt.LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
     # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
-    assimilation=AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
+    assimilation=rt.AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
     # Tiny changes decide whether a swing reaches the top: a plan on few episodes says little about others.
-    planner=PlannerConfig(realisations=64),
+    planner=rt.PlannerConfig(realisations=64),
 )
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Train twin and controllers on Gymnasium's Pendulum-v1.
 
     Args:
@@ -46,7 +35,7 @@ class Config(RunConfig):
 
     episodes: int = 10
     horizon: float = 10.0
-    twinning: TwinningConfig = field(default_factory=lambda: SWING_UP)
+    twinning: rt.TwinningConfig = SWING_UP
 
     def plant(self) -> Pendulum:
         return Pendulum(horizon=self.horizon)
@@ -55,16 +44,15 @@ class Config(RunConfig):
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
     # Here, because --help need not wait for TorchRL.
-    from rt_torchrl import Run
     from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 
     if not config.real_unseen:  # a simulator may fly
         config = dataclasses.replace(config, real_unseen=config.unseen)
     plant = config.plant()
-    device = require_device(config.device)
+    device = rt.require_device(config.device)
     env = partial(gymnasium_pendulum, plant, seed=config.seed, device=device)
-    Run(config, plant, env=env, **parts).train()
+    rt.Run(config, plant, env=env, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

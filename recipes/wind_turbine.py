@@ -5,31 +5,16 @@ from collections.abc import Callable
 from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from rt_torchrl import begin_loading, configuration
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 from torch import nn
 
-from rt_torchrl import (
-    PAPER,
-    AssimilationConfig,
-    DescentConfig,
-    HypothesesConfig,
-    LearnerConfig,
-    PlannerConfig,
-    Plant,
-    PredictiveConfig,
-    Preset,
-    RunConfig,
-    TwinningConfig,
-    main_of,
-    require_device,
-)
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
 from rt_torchrl.envs.wind_turbine.disturbances import RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
@@ -38,27 +23,22 @@ from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
 from rt_torchrl.options import Text
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from rt_torchrl import Snapshot
-
-LBFGS = DescentConfig(optimiser="lbfgs", rate=1.0)
-PAPER_T1 = dataclasses.replace(PAPER, planner=dataclasses.replace(PAPER.planner, descent=LBFGS))
+LBFGS = rt.DescentConfig(optimiser="lbfgs", rate=1.0)
+PAPER_T1 = dataclasses.replace(rt.PAPER, planner=dataclasses.replace(rt.PAPER.planner, descent=LBFGS))
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T1."""
-DEFAULT = TwinningConfig(
+DEFAULT = rt.TwinningConfig(
     # Targets span 5 s: an action of 0.5 s moves a rotor with a time constant of 16 s by less than the critic's error.
     # Beside a twin a hundred iterations end where the paper's 500 and 1000 end.
-    learner=LearnerConfig(critic_iterations=100, actor_iterations=100, return_steps=10),
+    learner=rt.LearnerConfig(critic_iterations=100, actor_iterations=100, return_steps=10),
     # Fits and plans converge over the episodes. The wind is the measured one, because draws of it leave an error in the
     # closure, and the plans 1 to 2 % above the optimum. While the first closures are wrong, a plan of a hundred
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
-    assimilation=AssimilationConfig(iterations=60, method="lbfgs", inputs="record"),
-    planner=PlannerConfig(
+    assimilation=rt.AssimilationConfig(iterations=60, method="lbfgs", inputs="record"),
+    planner=rt.PlannerConfig(
         iterations=25,
         realisations=50,
         descent=dataclasses.replace(LBFGS, tolerance=1e-6),
-        receding_horizon=PredictiveConfig(horizon=20.0),
+        receding_horizon=rt.PredictiveConfig(horizon=20.0),
     ),
 )
 """Configuration of the training by default."""
@@ -68,10 +48,10 @@ NEURAL = dataclasses.replace(
     # the rotor's time constant of 16 s, because over whole records most steps fail. One wind shows a part of (λ, β),
     # so that there are six.
     records=6,
-    assimilation=AssimilationConfig(
+    assimilation=rt.AssimilationConfig(
         iterations=10, method="levenberg_marquardt", inputs="record", segment=20, prior=0.02
     ),
-    hypotheses=HypothesesConfig(which=("none",)),
+    hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""
 
@@ -79,8 +59,8 @@ OBSERVED = {"paper": "paper", "bias": "paper", "scheduled": "scheduled", "mlp": 
 """What each kind of policy observes by default."""
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
@@ -118,7 +98,7 @@ class Config(RunConfig):
     model_error: bool = False
     unknown: tuple[str, ...] = ()
     real: Literal["simulation", "rosco"] = "simulation"
-    twinning: TwinningConfig = field(default_factory=lambda: DEFAULT)
+    twinning: rt.TwinningConfig = DEFAULT
 
     def __post_init__(self):
         super().__post_init__()
@@ -130,11 +110,11 @@ class Config(RunConfig):
             other = "model_error" if self.model_error else "real='rosco'"
             raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")
 
-    def presets(self) -> dict[Preset, dict[str, Any]]:
+    def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         paper = {"policy": "paper", "start": "random", "twinning": PAPER_T1}
         return super().presets() | {"paper": paper, "neural": {"closure": "mlp", "twinning": NEURAL}}
 
-    def plant(self) -> Plant:
+    def plant(self) -> rt.Plant:
         return unknown(self.turbine(), self.unknown)
 
     def believed(self) -> WindTurbine | None:
@@ -166,7 +146,7 @@ class Config(RunConfig):
         worn, middle = PowerCoefficientTable.nrel5mw(worn=True), self.effective().episodes // 2
         return lambda episode: plant.closure if episode < middle else worn
 
-    def plant_figures(self, snapshot: "Snapshot") -> dict[str, "Figure"]:
+    def plant_figures(self, snapshot):
         from rt_torchrl.envs.wind_turbine import figures  # here, because an episode need not wait for Matplotlib
 
         return figures.figures_of(snapshot)
@@ -174,16 +154,15 @@ class Config(RunConfig):
 
 def main(config: Config, **parts: Any) -> None:
     """Train; ``parts`` are further arguments of :class:`Run`, such as ``learner``."""
-    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
     from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
-        env = partial(rosco_turbine, plant, seed=config.seed, device=require_device(config.device))
+        env = partial(rosco_turbine, plant, seed=config.seed, device=rt.require_device(config.device))
         config = dataclasses.replace(config, real_unseen=config.real_unseen or config.unseen)  # a simulator may fly
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
-    Run(config, plant, first=JonkmanController, **{**system, **parts}).train()
+    rt.Run(config, plant, first=JonkmanController, **{**system, **parts}).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

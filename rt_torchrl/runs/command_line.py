@@ -187,8 +187,14 @@ def load_recipe(path: Path) -> ModuleType:
 
 
 def shipped_plants() -> dict[str, type[Plant]]:
-    """The plant class of each folder under ``rt_torchrl.envs``, by the folder's name."""
-    return {m.name: _class_in(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
+    """The plant class of each folder under ``rt_torchrl.envs``, by the folder's name; ``plant.py`` there holds one."""
+    found = {}
+    for folder in pkgutil.iter_modules(rt_torchrl.envs.__path__):
+        if folder.ispkg:
+            module = importlib.import_module(f"rt_torchrl.envs.{folder.name}.plant")
+            kinds = [kind for kind in vars(module).values() if inspect.isclass(kind) and issubclass(kind, Plant)]
+            (found[folder.name],) = [kind for kind in kinds if kind.__module__ == module.__name__]
+    return found
 
 
 def plant_class(name: str) -> type[Plant]:
@@ -212,20 +218,3 @@ def plant_class(name: str) -> type[Plant]:
     if not (inspect.isclass(found) and issubclass(found, Plant)):
         raise ValueError(f"plant={name!r} is no class derived from Plant.")
     return found
-
-
-def _class_in(folder: str) -> type[Plant]:
-    """The one plant class that ``<folder>/plant.py`` defines.
-
-    Raises:
-        ValueError: if it defines no plant, or more than one.
-    """
-    module = importlib.import_module(f"rt_torchrl.envs.{folder}.plant")
-    found = [
-        kind
-        for kind in vars(module).values()
-        if inspect.isclass(kind) and issubclass(kind, Plant) and kind.__module__ == module.__name__
-    ]
-    if len(found) != 1:
-        raise ValueError(f"{module.__name__} defines {len(found)} plants; a folder under envs holds exactly one.")
-    return found[0]

@@ -42,8 +42,8 @@ class FinishedRun:
         judged: whether ``curve`` holds costs on unseen episodes.
         real: J_a of each real episode.
         merit: mean of each of the plant's own quantities under that policy.
-        controllers: J_a of each classical controller, mean over the unseen episodes.
-        controllers_merit: the plant's own quantities of each classical controller.
+        controllers: mean J_a of each classical controller over the unseen episodes, and means of the plant's own
+            quantities.
         alarms: number of episodes with an alarm.
         seconds: time of the six steps in all episodes [s].
     """
@@ -57,8 +57,7 @@ class FinishedRun:
     judged: bool
     real: list[float]
     merit: dict[str, float]
-    controllers: dict[str, float]
-    controllers_merit: dict[str, dict[str, float]]
+    controllers: dict[str, tuple[float, dict[str, float]]]
     alarms: int
     seconds: float
 
@@ -98,8 +97,10 @@ class FinishedRun:
             judged=judged,
             real=_numbers(episode["real_cost"] for episode in episodes),
             merit=_means(unseen["merit"][live]),
-            controllers={name: statistics.fmean(_numbers(unseen["costs"][name])) for name in unseen["baselines"]},
-            controllers_merit={name: _means(judged["merit"]) for name, judged in unseen["baselines"].items()},
+            controllers={
+                name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(found["merit"]))
+                for name, found in unseen["baselines"].items()
+            },
             alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
             seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),
         )
@@ -208,9 +209,7 @@ class Comparison:
         controllers: dict[str, tuple[float, dict[str, float]]] = {}
         for rows in groups:
             run, task = rows[0].runs[0], f" ({rows[0].name})" if len(groups) > 1 else ""
-            controllers |= {
-                f"{name}{task}": (cost, run.controllers_merit[name]) for name, cost in run.controllers.items()
-            }
+            controllers |= {f"{name}{task}": found for name, found in run.controllers.items()}
         return controllers
 
     def numbers(self) -> dict[str, Any]:
@@ -382,7 +381,7 @@ def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) ->
         ax.plot(number, np.median(curves, 0), marker, markersize=4, label=row.name, **look)
     for optimum in {row.optimum for row in rows if row.optimum is not None}:
         ax.axhline(optimum, color="black", linewidth=1.0, label="optimum")
-    for (name, cost), dash in zip(rows[0].runs[0].controllers.items(), DASHES * len(names), strict=False):
+    for (name, (cost, _)), dash in zip(rows[0].runs[0].controllers.items(), DASHES * len(names), strict=False):
         ax.axhline(cost, label=name, **REFERENCE_LINE | {"linestyle": dash})
     caption(ax, f"{title}: $J_a$")
     logarithmic_if_wide(ax)

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
@@ -35,52 +34,26 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
-class Resting:
-    """The fallback of a safety layer where nothing else is known: the action nearest to zero within the limits.
-
-    Args:
-        controller: controller that the real system has had so far, which acts instead; None if there is none.
-        rest: that action.
-        dt: control interval [s].
-    """
-
-    def __init__(self, controller: StateFeedback | None, rest: Tensor, *, dt: float):
-        self.controller, self.rest = controller, rest
-        self._dt, self._intervals = dt, 0
-
-    def begin(self) -> None:
-        """Begin an episode."""
-        self._intervals = 0
-        if self.controller is not None:
-            self.controller.begin()
-
-    def __call__(self, reported: TensorDictBase) -> Tensor:
-        """The action of the next interval; the controller is asked in each one, so that its memory goes on."""
-        if self.controller is None:
-            return self.rest
-        t, self._intervals = self._intervals * self._dt, self._intervals + 1
-        return self.controller.act(t, reported["state"], reported["exogenous"])
-
-
 def simulated(
     plant: Plant, config: RunConfig, first: type[ClassicalController] | None, *, device: torch.device
 ) -> EnvBase:
     """The real system in simulation, with the sensors and the wear of the configuration.
 
     With limits it is behind a safety layer, whose fallback is the controller that the real system has had so far, or
-    rest.
+    the action nearest to zero within the limits.
     """
     wear = config.wear(plant)
     env = PlantEnv(plant, seed=config.seed, device=device, noise=config.noise, wear=wear)
     if not config.twinning.limits:
         return env
     limits = OperatingLimits(plant, config.twinning.limits)
-    controller = None if first is None else first(plant).to(device)
-    zero = env.action_spec.zero()
-    low, high = (zero.new_tensor(end) for end in limits.actions)
-    rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
     config_of_layer = SafetyConfig(interval=plant.dt, **limits.safety())
-    return SafetyLayer(env, config_of_layer, fallback=Resting(controller, rest, dt=plant.dt))
+    if first is not None:
+        return SafetyLayer(env, config_of_layer, fallback=first(plant).to(device))
+    space = env.action_spec.space
+    ends = zip(*limits.actions, space.low.flatten().tolist(), space.high.flatten().tolist(), strict=True)
+    rest = [min(max(0.0, low, least), high, greatest) for low, high, least, greatest in ends]
+    return SafetyLayer(env, config_of_layer, fallback=rest)
 
 
 def judged_on(

@@ -5,7 +5,7 @@ import errno
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from rt_torchrl.evaluation.unseen import (
     Judged,
     RealController,
     RealEpisodes,
-    UnseenEpisodes,
     mean_with_confidence,
 )
 from rt_torchrl.figures.snapshot import Snapshot
@@ -50,17 +49,6 @@ from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.preflight import check_record
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
-
-
-def first_flights(unseen: UnseenEpisodes, live: Role, flights: Mapping[str, Trajectory]) -> dict[str, "Figure"]:
-    """The figure of the first unseen episode under the live policy and the classical controllers."""
-    idle = {role for role in ROLES if role != live}
-    shown = {who: flown.each()[0] for who, flown in flights.items() if who not in idle}
-    where = "on the twin" if unseen.closure is None else ""
-    return {"flights": figures.flights(unseen.physics, shown, where=where)}
 
 
 class Run:
@@ -253,15 +241,7 @@ class Run:
             metrics = self._results(gap, flights, judged, real)
             if self.config.figures:
                 bar.doing("drawing the figures")
-                flown = first_flights(self.unseen, self.algorithm.referee.live, flights)
-                where = "on the twin" if self.unseen.judged_on == "twin" else ""
-                unseen = {"unseen": figures.unseen(judged, where=where)}
-                folder = self.folder / "figures"
-                images = self._pixels(flown | unseen)
-                folder.mkdir(exist_ok=True)
-                for name, image in images.items():
-                    figures.save_pixels(image, folder / f"{name}.png")
-                dashboard.images(images, len(self.episodes) - 1)
+                dashboard.images(self._drawn(flights, judged), len(self.episodes) - 1)
         table = results_table(metrics)
         dashboard.results(metrics["summary"], table)
         dashboard.close()
@@ -376,8 +356,16 @@ class Run:
         write_json(self.folder / "metrics.json", metrics)
         return metrics
 
-    def _pixels(self, others: Mapping[str, "Figure"]) -> dict[str, np.ndarray]:
-        """Pixels of the figures of the training and of others, by name; each is drawn once."""
+    def _drawn(self, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged]) -> dict[str, np.ndarray]:
+        """Draw the figures of the training and of the unseen episodes, into ``figures/``; their pixels by name."""
+        live, where = self.algorithm.referee.live, "on the twin" if self.unseen.judged_on == "twin" else ""
+        shown = {who: flown.each()[0] for who, flown in flights.items() if who == live or who not in ROLES}
         snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
-        drawn = {**figures.figures_of(snapshot), **self.config.plant_figures(snapshot), **others}
-        return {name: figures.pixels(figure) for name, figure in drawn.items()}
+        drawn = {**figures.figures_of(snapshot), **self.config.plant_figures(snapshot)}
+        drawn["flights"] = figures.flights(self.unseen.physics, shown, where=where)
+        drawn["unseen"] = figures.unseen(judged, where=where)
+        images = {name: figures.pixels(figure) for name, figure in drawn.items()}
+        (self.folder / "figures").mkdir(exist_ok=True)
+        for name, image in images.items():
+            figures.save_pixels(image, self.folder / "figures" / f"{name}.png")
+        return images

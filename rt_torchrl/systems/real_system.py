@@ -49,49 +49,41 @@ class Reading:
     def __post_init__(self) -> None:
         require_numbers("reading", scale=self.scale, offset=self.offset)
 
-    def read(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+    def read(
+        self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str, *, finite: bool = True
+    ) -> Float[Tensor, "1 n"]:
         """The vector in the plant's units.
 
-        Raises:
-            ValueError: if :meth:`vector` raises it, or the vector is not finite.
-        """
-        vector = self.vector(reported, signals, what)
-        if not vector.isfinite().all():
-            names = [signal.name for signal in signals]
-            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {vector[0].tolist()}.")
-        return vector
-
-    def vector(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
-        """The vector in the plant's units, whatever its values.
+        Args:
+            reported: report of the environment.
+            signals: signals of the vector.
+            what: name of the vector in errors.
+            finite: whether it must be finite.
 
         Raises:
-            ValueError: if an entry is missing or a tuple, or the vector does not have the shape of the signals.
+            ValueError: if an entry is missing or a tuple, or the vector does not have the shape of the signals, or is
+                not finite.
         """
-        self.require(reported, what)
+        names = [signal.name for signal in signals]
+        missing = [key for key in self.keys if reported.get(key, None) is None]
+        if missing:
+            known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
+            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
         if tuples := [key for key in self.keys if reported.get(key).is_nested]:
             raise ValueError(
                 f"{what} is read from {tuples}, in which the environment reports a tuple of arrays; flatten it first, "
                 "such as GymWrapper(gymnasium.wrappers.FlattenObservation(env))."
             )
         vector = self.of(*(reported.get(key).double() for key in self.keys))
-        names = [signal.name for signal in signals]
         if tuple(vector.shape) != (*reported.batch_size, len(signals)):
             raise ValueError(
                 f"{what}, read from {list(self.keys)}, has shape {tuple(vector.shape)}; the plant needs "
                 f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
             )
-        return in_units(vector, self.scale, self.offset).reshape(1, len(signals))
-
-    def require(self, reported: TensorDictBase, what: str) -> None:
-        """Refuse a report that lacks an entry that is read.
-
-        Raises:
-            ValueError: if an entry is missing; it names the missing entries and those that are there.
-        """
-        missing = [key for key in self.keys if reported.get(key, None) is None]
-        if missing:
-            known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
-            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
+        vector = in_units(vector, self.scale, self.offset).reshape(1, len(signals))
+        if finite and not vector.isfinite().all():
+            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {vector[0].tolist()}.")
+        return vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,13 +232,13 @@ class RealSystem(EnvBase):
     def _require_fit(self) -> None:
         """Refuse, before the first step and without moving anything real, an environment that would fail in it."""
         imagined = self.env.fake_tensordict()  # zeros; a reading of them need not be finite
-        self._state.vector(imagined, self._read, "state")
+        self._state.read(imagined, self._read, "state", finite=False)
         if isinstance(self._exogenous, Reading):
-            self._exogenous.vector(imagined, self.plant.inputs, "exogenous")
+            self._exogenous.read(imagined, self.plant.inputs, "exogenous", finite=False)
         else:
             self._input(imagined)
         if self._applied is not None:
-            self._applied.vector(imagined["next"], self.plant.actions, "applied")
+            self._applied.read(imagined["next"], self.plant.actions, "applied", finite=False)
         elif "applied" in self.env.full_observation_spec:
             raise ValueError(
                 "the environment reports the action that it has applied, as a safety layer does, but no reading reads "

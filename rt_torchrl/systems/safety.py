@@ -21,6 +21,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
 from rt_torchrl.systems.environment import AroundSystem, innermost, layers
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen"})
@@ -28,7 +29,7 @@ WRONG = frozenset({"missing", "not finite", "out of range", "frozen"})
 ROUNDING = 1e-9
 """Slack in comparisons of times that are sums of intervals [s], and share of a rate by which rounding may exceed it."""
 
-Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
+Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor] | StateFeedback
 Ends = tuple[tuple[float, ...], tuple[float, ...]]
 
 
@@ -219,9 +220,10 @@ class SafetyLayer(AroundSystem):
     Args:
         env: environment of one real system, with batch size () or (1,).
         config: limits on actions and observations.
-        fallback: action within the range, or controller that makes an action from the TensorDict of the last
-            observation. One with a method ``begin`` has a memory: ``begin`` is called at every reset, and the
-            controller in every interval, so that its memory goes on while the policy acts and its action is not used.
+        fallback: action within the range; a controller of a plant, where ``state`` and ``exogenous`` are observed; or a
+            function that makes an action from the TensorDict of the last observation. One with a method ``begin`` has a
+            memory: ``begin`` is called at every reset, and the controller in every interval, so that its memory goes on
+            while the policy acts and its action is not used.
         clock: wall clock [s].
 
     Raises:
@@ -259,7 +261,11 @@ class SafetyLayer(AroundSystem):
         self._unwritten: OSError | None = None
         self._make_specs()
         self.watchdog, self.limits = Watchdog(config), ActionLimits(env.action_spec, config)
-        self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
+        self._fallback: Tensor | Callable[[TensorDictBase], Tensor] | StateFeedback
+        if isinstance(fallback, StateFeedback) or callable(fallback):
+            self._fallback = fallback
+        else:
+            self._fallback = self.limits.sendable("fallback", fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
             config.log.touch()
@@ -338,7 +344,9 @@ class SafetyLayer(AroundSystem):
             self.watchdog.note(t, True)
         tripped = self.watchdog.tripped(t)
         other = self._fallback
-        if callable(other) and (tripped or hasattr(other, "begin")):
+        if isinstance(other, StateFeedback):
+            other = other.act(t, tensordict["state"], tensordict["exogenous"])
+        elif callable(other) and (tripped or hasattr(other, "begin")):
             other = other(tensordict)
         if tripped:
             action = cast(Tensor, other)

@@ -195,21 +195,18 @@ class ConnectedPlant(ForeignSystem):
         values = dict(zip(self._commands, tensordict["action"].reshape(-1).tolist(), strict=True))
         if self._answered is not None:
             values[self._answered] = self._sample
-        through = self._up() and self._written(values)
+        through = self._up()
+        try:
+            if through:
+                self.link.write(values)
+        except LinkLostError as error:
+            through = False
+            self._lose(error)
         self.pace.wait()
         reading = self._fresh() if self._connected else None
         if not through:
             reading, self.reasons = None, {"commands": f"not written: {self._lost}"}
         return self._stepped(self._entries(reading))
-
-    def _written(self, values: Mapping[str, float]) -> bool:
-        """Write the commands; whether they got through."""
-        try:
-            self.link.write(values)
-        except LinkLostError as error:
-            self._lose(error)
-            return False
-        return True
 
     def _fresh(self) -> dict[str, float] | None:
         """A reading newer than the last one; None if none comes in time."""
