@@ -14,7 +14,7 @@ from torch import nn
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
-from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
+from rt_torchrl.envs.cryogenic_tank.unknown import unknown
 from rt_torchrl.options import Text
 
 # Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
@@ -113,7 +113,7 @@ class Config(rt.RunConfig):
         super().__post_init__()
         CryogenicTank.chosen(self.observe)
         self.cost()
-        require_unknown(self.unknown)
+        unknown.changes(self.unknown)  # which refuses what does not go together
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"

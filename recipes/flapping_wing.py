@@ -10,7 +10,7 @@ if __name__ == "__main__":
 
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
-from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
+from rt_torchrl.envs.flapping_wing.unknown import unknown
 from rt_torchrl.options import Text
 
 # Commands of a tenth of a beat; a plan is made twice a beat. A flight with plans of 1 s costs 0.1 % more than one with
@@ -124,7 +124,7 @@ class Config(rt.RunConfig):
         super().__post_init__()
         FlappingWing.chosen(self.observe)
         TrackingCost(peak=self.peak)
-        require_unknown(self.unknown)
+        unknown.changes(self.unknown)  # which refuses what does not go together
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
 

@@ -20,7 +20,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
-from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
+from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.options import Text
 
 LBFGS = rt.DescentConfig(optimiser="lbfgs", rate=1.0)
@@ -105,7 +105,7 @@ class Config(rt.RunConfig):
         if self.task == "paper" and self.engineering != EngineeringCost():
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
-        require_unknown(self.unknown)
+        unknown.changes(self.unknown)  # which refuses what does not go together
         if self.unknown and (self.model_error or self.real == "rosco"):
             other = "model_error" if self.model_error else "real='rosco'"
             raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")

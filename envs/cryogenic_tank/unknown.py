@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import partial
 
 from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.plants.extension import System, combined, require_systems
+from rt_torchrl.plants.extension import Catalogue, System
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.plants.vector_field import NeuralResidual
@@ -55,9 +55,7 @@ SYSTEMS: Mapping[str, System] = {
 """What the real tank has beside its twin, by the names of ``--unknown``."""
 
 
-require_unknown = partial(require_systems, systems=SYSTEMS)
-"""Refuses names that do not exist, or change the same part."""
-unknown = partial(combined, systems=SYSTEMS, parts=PARTS)
+unknown = Catalogue(SYSTEMS, PARTS)
 """``unknown(plant, names)`` is the real tank that has all that the names say; its twin is ``plant``."""
 
 

@@ -13,7 +13,7 @@ from rt_torchrl.plants.actuators import (
     ResonantActuator,
     ScaledActuator,
 )
-from rt_torchrl.plants.extension import System, combined, require_systems
+from rt_torchrl.plants.extension import Catalogue, System
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.vector_field import NeuralResidual
 
@@ -91,9 +91,7 @@ SYSTEMS: Mapping[str, System] = {
 """What the real drone has beside its twin, by the names of ``--unknown``."""
 
 
-require_unknown = partial(require_systems, systems=SYSTEMS)
-"""Refuses names that do not exist, or change the same part."""
-unknown = partial(combined, systems=SYSTEMS, parts=PARTS)
+unknown = Catalogue(SYSTEMS, PARTS)
 """``unknown(plant, names)`` is the real drone that has all that the names say; its twin is ``plant``."""
 
 

@@ -20,7 +20,7 @@ from rt_torchrl.plants.actuators import (
     StickingActuator,
 )
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
+from rt_torchrl.plants.extension import Catalogue, Extension, System, replaced
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Hidden, Input, Inputs, Scalar, State, Time
 from rt_torchrl.plants.signal import Signal
@@ -291,7 +291,5 @@ SYSTEMS: dict[str, System] = {
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
 SYSTEMS["all"] = {**SYSTEMS["inflow"], **SYSTEMS["torque_loss"], **SYSTEMS["anemometer_low"], **SYSTEMS["pitch"]}
 
-require_unknown = partial(require_systems, systems=SYSTEMS)
-"""Refuses names that do not exist, or change the same part."""
-unknown = partial(combined, systems=SYSTEMS, parts=PARTS)
+unknown = Catalogue(SYSTEMS, PARTS)
 """``unknown(plant, names)`` is the real turbine that has all that the names say; its twin is ``plant``."""

@@ -181,17 +181,17 @@ class UnseenEpisodes:
         flown = flown.segments(segment, physics.dt) if segment else flown
         measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
 
-        def costs(some: slice) -> Float[Tensor, " some"]:
-            start = flown.start[some] if isinstance(flown.start, Tensor) else flown.start
+        def costs(some: Trajectory) -> Costs:
             try:
-                replayed = rollout(measured[some, 0], flown.exogenous[some], flown.actions[some], start=start)
+                replayed = rollout(some.states[:, 0], some.exogenous, some.actions, start=some.start)
             except DivergenceError:
-                count = len(measured[some])
-                each = [slice(k, k + 1) for k in range(*some.indices(len(measured)))]
-                return torch.cat([costs(one) for one in each]) if count > 1 else measured.new_full((1,), torch.inf)
-            return identification_cost(physics, replayed, measured[some])
+                if len(some.states) == 1:
+                    return some.states.new_full((1,), torch.inf)
+                each = torch.arange(len(some.states), device=some.states.device).split(1)
+                return torch.cat([costs(some.rows(row)) for row in each])
+            return identification_cost(physics, replayed, some.states)
 
-        return costs(slice(len(measured))).unflatten(0, (episodes, -1)).mean(1)
+        return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
 
 
 class TwinEpisodes(UnseenEpisodes):

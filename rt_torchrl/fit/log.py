@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,6 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
-READERS = (".csv", ".parquet")
-"""Ends of the names of files that are read, in small letters."""
 NUMBER = r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|inf|nan)"
 COLUMN = re.compile(
     rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
@@ -269,11 +267,10 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
 
 def _read(path: Path) -> Any:
     """The table of a file, with its headers."""
-    readers = dict(zip(READERS, (_read_csv, _read_parquet), strict=True))
-    if (kind := path.suffix.lower()) not in readers:
-        raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
+    if (kind := path.suffix.lower()) not in READERS:
+        raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(READERS)}.")
     try:
-        frame = readers[kind](path)
+        frame = READERS[kind](path)
     except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
         raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error
     frame.columns = [str(header).strip() for header in frame]
@@ -311,6 +308,10 @@ def _read_parquet(path: Path) -> Any:
     return frame.reset_index() if any(name is not None for name in frame.index.names) else frame
 
 
+READERS: dict[str, Callable[[Path], Any]] = {".csv": _read_csv, ".parquet": _read_parquet}
+"""What reads a file, by the end of its name in small letters."""
+
+
 def _values(series: Any, column: Column, unit: str, path: Path) -> Rows:
     """Numbers of a column in the signal's unit; a date becomes the seconds since the first date."""
     if series.empty:
@@ -341,24 +342,19 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Rows:
 def _seconds(series: Any, about: str) -> Any:
     """Durations in seconds, or the seconds of dates since the first one."""
     pd = pandas()
-    if pd.api.types.is_timedelta64_dtype(series):
-        return series.dt.total_seconds()
-    if pd.api.types.is_datetime64_any_dtype(series):
-        dates = pd.to_datetime(series, utc=True)
-    else:
-        text, there = series.astype(str), series.notna()
-        dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
-        durations = pd.to_timedelta(text, errors="coerce")
-        as_dates = dates.notna().sum() >= durations.notna().sum()
-        offset = text.str.contains(WITH_OFFSET)
-        faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}
-        if as_dates:
-            faults["like the first one: with an offset from UTC, or without"] = offset != offset[there].iloc[0]
-        for what, wrong in faults.items():
-            if (wrong & there).any():
-                raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & there, what)}")
-        if not as_dates:
-            return durations.dt.total_seconds()
+    text, there = series.astype(str), series.notna()
+    dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
+    durations = pd.to_timedelta(text, errors="coerce")
+    as_dates = dates.notna().sum() >= durations.notna().sum()
+    offset = text.str.contains(WITH_OFFSET)
+    faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}
+    if as_dates:
+        faults["like the first one: with an offset from UTC, or without"] = offset != offset[there].iloc[0]
+    for what, wrong in faults.items():
+        if (wrong & there).any():
+            raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & there, what)}")
+    if not as_dates:
+        return durations.dt.total_seconds()
     return (dates - dates.dropna().iloc[0]).dt.total_seconds()
 
 

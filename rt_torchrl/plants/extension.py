@@ -4,7 +4,7 @@ import copy
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -236,43 +236,42 @@ System = Mapping[str, Change]
 """What makes a real system of a plant, by the part of the plant that it changes."""
 
 
-def require_systems(names: Sequence[str], systems: Mapping[str, System]) -> None:
-    """Refuse names of real systems that do not exist, or cannot be combined.
+class Catalogue(NamedTuple):
+    """Real systems that are made of a plant, by name; they combine if they change different parts.
 
     Args:
-        names: names of the systems that are combined.
-        systems: all systems, by name.
-
-    Raises:
-        ValueError: if a name does not exist, or two of the systems change the same part.
-    """
-    missing = [name for name in names if name not in systems]
-    if missing:
-        raise ValueError(f"unknown={tuple(names)}: {', '.join(missing)} does not exist; choose {', '.join(systems)}.")
-    changed: dict[str, str] = {}
-    for name in names:
-        for part in systems[name]:
-            if part in changed:
-                raise ValueError(
-                    f"unknown={tuple(names)}: {changed[part]} and {name} both change the {part}; give one of them."
-                )
-            changed[part] = name
-
-
-def combined(plant: Plant, names: Sequence[str], systems: Mapping[str, System], parts: Sequence[str]) -> Plant:
-    """The plant with all that the named systems have beside it.
-
-    Args:
-        plant: the plant that a twin knows.
-        names: names of the systems; none gives the plant.
         systems: all systems, by name.
         parts: all parts of the plant that a system may change, in the order in which the changes are made.
-
-    Raises:
-        ValueError: as :func:`require_systems`.
     """
-    require_systems(names, systems)
-    changes = {part: change for name in names for part, change in systems[name].items()}
-    for part in parts:
-        plant = changes[part](plant) if part in changes else plant
-    return plant
+
+    systems: Mapping[str, System]
+    parts: tuple[str, ...]
+
+    def changes(self, names: Sequence[str]) -> dict[str, Change]:
+        """What the named systems change, by part.
+
+        Raises:
+            ValueError: if a name does not exist, or two of the systems change the same part.
+        """
+        missing = ", ".join(name for name in names if name not in self.systems)
+        if missing:
+            raise ValueError(f"unknown={tuple(names)}: {missing} does not exist; choose {', '.join(self.systems)}.")
+        found: dict[str, tuple[str, Change]] = {}
+        for name in names:
+            for part, change in self.systems[name].items():
+                if part in found:
+                    both = f"{found[part][0]} and {name} both change the {part}"
+                    raise ValueError(f"unknown={tuple(names)}: {both}; give one of them.")
+                found[part] = name, change
+        return {part: change for part, (_, change) in found.items()}
+
+    def __call__(self, plant: Plant, names: Sequence[str]) -> Plant:
+        """The plant, which a twin knows, with all that the named systems have beside it.
+
+        Raises:
+            ValueError: as :meth:`changes`.
+        """
+        changes = self.changes(names)
+        for part in self.parts:
+            plant = changes[part](plant) if part in changes else plant
+        return plant

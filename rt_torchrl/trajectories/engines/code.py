@@ -418,17 +418,11 @@ def _made(
         _tries[key] += 1
         if isinstance(error, UncomparedError) and _tries[key] < TRIES:
             return None
-        reason = _reason(error)
-        warnings.warn(f"engine 'autograd' takes the place of 'native': {reason}.", stacklevel=2)
-        return reason
+        kind = "" if isinstance(error, UntraceableError) else f"{type(error).__name__}: "
+        text = kind + str(error).rstrip(".")
+        warnings.warn(f"engine 'autograd' takes the place of 'native': {text}.", stacklevel=2)
+        return UntraceableError(text)  # without the traceback, which would keep the traced tensors
     return code
-
-
-def _reason(error: Exception) -> UntraceableError:
-    """Why there is no machine code, without the traceback, which would keep the traced tensors."""
-    if isinstance(error, UntraceableError):
-        return error.with_traceback(None)
-    return UntraceableError(f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}")
 
 
 def require_pure_once(interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
