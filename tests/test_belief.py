@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import drawn
 from tensordict import TensorDict
 from test_algorithm import flown, twinning
 
@@ -49,8 +50,7 @@ def said(policy):
 
 def record():
     plant = LinearQuadratic(horizon=2.0)
-    generator = torch.Generator().manual_seed(0)
-    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    state, exogenous = drawn(plant)
     with torch.no_grad():
         flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
     return Trajectory(flown.states[0], flown.actions[0], exogenous[0])

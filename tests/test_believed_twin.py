@@ -6,6 +6,7 @@ import pytest
 import torch
 from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import drawn
 from small_runs import SMALL
 from test_export_recipe import recipe
 from test_hypotheses import Suspecting, ensemble
@@ -135,8 +136,7 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
     plant = Suspecting(horizon=1.0)
     twin, _ = ensemble(plant)
     twin.weights = {ALONE: 0.25, "late": 0.75}
-    generator = torch.Generator().manual_seed(0)
-    start, z = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
+    start, z = drawn(plant, 2)
     controller = PredictiveControl(plant, twin.closure, PredictiveConfig(horizon=0.5, forecast="held"))
     expected = []
     for name in (ALONE, "late"):

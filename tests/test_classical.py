@@ -3,6 +3,7 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from seeds_and_numbers import drawn
 
 from rt_torchrl import ClassicalController, DivergenceError, SaturatedAffine
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
@@ -29,8 +30,8 @@ LOAD = torch.tensor([[130.0]], dtype=torch.float64)
 
 
 def episodes(plant, count=6, size=0.3):
-    generator = torch.Generator().manual_seed(0)
-    return size * plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+    state, exogenous = drawn(plant, count)
+    return size * state, exogenous
 
 
 def test_a_flight_is_the_plants_steps_under_the_saturated_command():

@@ -10,7 +10,7 @@ import torch
 from c_build import COMPILER, library, needs_compiler
 from linear_quadratic import LinearQuadratic
 from printed_commands import TEXTS, blocks
-from seeds_and_numbers import seeded
+from seeds_and_numbers import drawn, seeded
 
 from rt_torchrl import DISCON, SaturatedAffine, StateFeedback, export_discon
 from rt_torchrl.contract.check import require_controller
@@ -43,14 +43,9 @@ def scheduled(tmp_path_factory):
     if COMPILER is None:
         pytest.skip("no C compiler here")
     plant = WindTurbine(observe=("scheduled",))
-    policy, start, wind = GainScheduled(plant, generator=seeded(4)), *drawn(plant, 2)
+    policy, start, wind = GainScheduled(plant, generator=seeded(4)), *drawn(plant, 2, 5)
     file = exported(tmp_path_factory.mktemp("scheduled"), policy, plant)
     return plant, policy, file, DISCON(plant, file).fly(start, wind)
-
-
-def drawn(plant, count):
-    generator = seeded(5)
-    return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
 
 
 def in_torch(plant, policy, flown, passed):
@@ -191,7 +186,7 @@ def test_a_library_is_told_the_state_of_the_turbine(tmp_path):
 @needs_compiler
 def test_a_library_may_fail_or_warn(tmp_path):
     plant = WindTurbine(horizon=5.0)
-    start, wind = drawn(plant, 1)
+    start, wind = drawn(plant, 1, 5)
     fails = DISCON(plant, compiled(tmp_path, '{ *fail = s[1] > 0.9f ? -1 : 0; strcpy(message, "no oil"); }', "fails"))
     with pytest.raises(ValueError, match=r"fails\.so failed at t = 1 s: no oil"):
         fails.fly(start, wind)
@@ -245,7 +240,7 @@ def test_roscos_controller_flies_our_turbine(capfd):
     rosco = pytest.importorskip("rosco")
     file = Path(rosco.__file__).parent.parent / "Examples" / "Test_Cases" / "NREL-5MW" / "DISCON.IN"
     plant = WindTurbine(horizon=200.0)
-    controller, (start, wind) = DISCON(plant, rosco.discon_lib_path, file), drawn(plant, 2)
+    controller, (start, wind) = DISCON(plant, rosco.discon_lib_path, file), drawn(plant, 2, 5)
     flown = controller.fly(start, wind)
     speed = plant.gear_ratio * flown.states[:, 100:, 0]
     power = plant.generator_power(flown.states[:, :-1], flown.actions)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
+from seeds_and_numbers import drawn
 from small_runs import SMALL
 from test_learn import values
 from test_real_system import Rig, connected
@@ -56,11 +57,6 @@ class Falling(LinearQuadratic):
 WEAK, STRONG = [[0.1, 0.1]], [[4.0, 2.5]]
 
 
-def drawn(plant, count=6, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
-
-
 def by_hand(plant, policy, state, inputs):
     """Number of intervals flown and J_a of one episode."""
     total = 0.0
@@ -77,7 +73,7 @@ def by_hand(plant, policy, state, inputs):
 @pytest.mark.parametrize("gain", [WEAK, STRONG])
 def test_the_cost_of_an_episode_that_ends_is_the_sum_by_hand(engine, gain):
     plant, policy = Falling(), LinearGain(gain)
-    start, inputs = drawn(plant)
+    start, inputs = drawn(plant, 6)
     found = [by_hand(plant, policy, *episode) for episode in zip(start, inputs, strict=True)]
     assert all(n < plant.n_steps for n, _ in found) == (gain is WEAK)
     rollout = Rollout(plant, plant.closure, policy, engine=engine)
@@ -94,7 +90,7 @@ def test_the_cost_of_an_episode_that_ends_is_the_sum_by_hand(engine, gain):
 def test_the_gradient_is_that_of_the_same_end(engine):
     """Between two weights whose episodes end after the same numbers of intervals, the cost is smooth."""
     plant, policy = Falling(), LinearGain(WEAK)
-    start, inputs = drawn(plant)
+    start, inputs = drawn(plant, 6)
     rollout = Rollout(plant, plant.closure, policy, engine=engine)
     rollout.costs(start, inputs).mean().backward()
     step = 1e-5

@@ -6,6 +6,7 @@ import pytest
 import torch
 from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import Time
 from small_runs import SMALL
 from test_algorithm import twinning
 
@@ -21,21 +22,9 @@ from rt_torchrl.systems.sound_part import GREATEST
 DT, N = 0.1, 40
 
 
-class Wait:
-    """A clock and a sleep that take no time."""
-
-    now = 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.now += seconds
-
-
 def guarded(*injections, plant=None, **options):
     """A plant with these faults behind a layer that watches for them; all components but the first may rest."""
-    plant, wait = plant or LinearQuadratic(horizon=DT * N), Wait()
+    plant, wait = plant or LinearQuadratic(horizon=DT * N), Time()
     system = FaultySystem(PlantEnv(plant, seed=0), injections, sleep=wait.sleep)
     moving = (3, *[0] * (len(plant.readings) - 1))
     watched = {"ranges": {"state": (-1e8, 1e8)}, "frozen": {"state": moving}, "deadline": 0.5}

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import drawn
 from tensordict import TensorDict
 
 from rt_torchrl import DigitalTwin, ExtendedClosure, PlantEnv, ReinforcementTwinning, TwinningConfig
@@ -159,8 +160,7 @@ def test_an_episode_reports_the_twin_that_is_believed():
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
     twin, _ = fitted(PLANT, PLANT)
     policy = LinearGain([[1.0, 1.0]])
-    generator = torch.Generator().manual_seed(0)
-    episodes = PLANT.draw_initial_state(4, generator), PLANT.draw_exogenous(4, generator)
+    episodes = drawn(PLANT, 4)
     alone = twin.twins[ALONE].cost(policy, *episodes)
     torch.testing.assert_close(twin.cost(policy, *episodes), alone, rtol=0.01, atol=0.0)
 
@@ -169,8 +169,7 @@ def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
     twin, assimilation = ensemble(PLANT)
     twin.weights = {ALONE: 1.0, "late": 3.0}
     policy = LinearGain([[1.0, 1.0]])
-    generator = torch.Generator().manual_seed(0)
-    episodes = PLANT.draw_initial_state(4, generator), PLANT.draw_exogenous(4, generator)
+    episodes = drawn(PLANT, 4)
 
     def parts():
         each = [twin.twins[name] for name in (ALONE, "late")]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
-from seeds_and_numbers import seeded
+from seeds_and_numbers import drawn, seeded
 from test_extensions import flight
 from test_trajectory import recorded
 from torch import nn
@@ -175,11 +175,6 @@ def learned(real, names, noise=0.0):
     assimilation = EnsembleAssimilation(twin, ASSIMILATION, config)
     assimilation.update(list(records(real, noise)), (), 1, torch.Generator())
     return twin, assimilation.misfits
-
-
-def drawn(plant, count, seed):
-    generator = torch.Generator().manual_seed(seed)
-    return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
 
 
 def planned(twin, episodes):

@@ -9,7 +9,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from printed_commands import blocks
 from scipy.optimize import lsq_linear
-from seeds_and_numbers import seeded
+from seeds_and_numbers import drawn, seeded
 
 from rt_torchrl import Decaying, DivergenceError, PlantEnv, Rollout, StateFeedback, control_cost
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
@@ -36,11 +36,6 @@ def control(plant=PLANT, closure=None, **options):
 )
 def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode(dt, horizon, hold, expected):
     assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
-
-
-def episodes(batch=2, seed=1):
-    generator = seeded(seed)
-    return PLANT.draw_initial_state(batch, generator), PLANT.draw_exogenous(batch, generator)
 
 
 def on_the_real_system(controller, env, *, strength=0.0):
@@ -115,7 +110,7 @@ def test_it_flies_to_a_target_that_has_moved():
 def test_it_plans_on_the_closure_as_it_is_trained():
     """With the true closure it costs less than with a wrong one, and a copy keeps the closure that it has."""
     closure = LinearClosure(torch.tensor([[0.0, 0.0], [6.0, 0.0]]))
-    controller, (state, exogenous) = control(closure=closure), episodes(batch=4)
+    controller, (state, exogenous) = control(closure=closure), drawn(PLANT, 4, 1)
     wrong, kept = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean(), copy.deepcopy(controller)
     with torch.no_grad():
         closure.matrix.copy_(PLANT.closure.matrix)
@@ -210,7 +205,7 @@ class Scheduled:
 
 
 def test_plans_are_those_of_a_quadratic_program():
-    state, inputs = 2.0 * episodes(3)[0], PLANT.draw_exogenous(3, seeded(2))
+    state, inputs = 2.0 * drawn(PLANT, 3, 1)[0], PLANT.draw_exogenous(3, seeded(2))
     config = PredictiveConfig(horizon=1.0, tolerance=0.0, iterations=300)
     controller = RecedingHorizon(PLANT, PLANT.closure, config, forecast=Scheduled(inputs, PLANT.dt))
     found, bounded = controller.plan(0.4, state, inputs[:, 4]), 0
@@ -223,7 +218,7 @@ def test_plans_are_those_of_a_quadratic_program():
 
 @pytest.mark.parametrize("name", ["held", "decaying"])
 def test_its_forecast_is_that_of_the_inputs_met_and_is_kept(name):
-    (state, exogenous), records = episodes(seed=2), PLANT.draw_exogenous(9, seeded(9)).cumsum(1)
+    (state, exogenous), records = drawn(PLANT, 2, 2), PLANT.draw_exogenous(9, seeded(9)).cumsum(1)
     policy, again = control(forecast=name), control(forecast=name)
     held, before = (each.fly(state, exogenous).actions for each in (control(forecast="held"), policy))
     torch.testing.assert_close(before, held, rtol=0.0, atol=0.0)  # nothing is met yet

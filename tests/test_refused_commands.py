@@ -8,10 +8,11 @@ from functools import partial
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import Time
 from served_plants import free_port, in_a_thread
 from test_real_system import connected
 from test_safety import failing
-from test_served import ENTRIES, PLANT, Line, Time
+from test_served import ENTRIES, PLANT, Line
 from test_served import connected as client_of
 
 from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, Register, SafetyConfig, SafetyLayer

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import Time
 from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 from torchrl.data import Bounded, Unbounded
@@ -18,15 +19,6 @@ from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, layer_of
 from rt_torchrl.systems.sound_part import report_of
 
 DT = 0.1
-
-
-class Clock:
-    """A clock that the test moves."""
-
-    now = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 class Failing(PlantEnv):
@@ -47,11 +39,11 @@ class Failing(PlantEnv):
 
 def layer(env=None, *, fallback=(0.0,), clock=None, horizon=2.0, **options):
     env = PlantEnv(LinearQuadratic(horizon=horizon), seed=0) if env is None else env
-    return SafetyLayer(env, SafetyConfig(interval=DT, **options), fallback=fallback, clock=clock or Clock())
+    return SafetyLayer(env, SafetyConfig(interval=DT, **options), fallback=fallback, clock=clock or Time())
 
 
 def failing(clock=None, horizon=2.0, broken=(), late=(), value=float("nan"), **options):
-    clock = clock or Clock()
+    clock = clock or Time()
     env = Failing(LinearQuadratic(horizon=horizon), clock, broken=broken, late=late, value=value)
     return layer(env, clock=clock, **options)
 

@@ -12,6 +12,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from relay import Relay
+from seeds_and_numbers import Time, drawn
 from served_plants import free_port, served, served_turbine_alone
 from served_turbine import ServedPlant, machine
 from tensordict import TensorDict
@@ -31,8 +32,7 @@ def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples(
     for k, command in enumerate(asked.tolist()):
         states.append([plant.published()[f"state.{state.name}"] for state in PLANT.states])
         plant.advance([command], float(k + 1))
-    generator = torch.Generator().manual_seed(3)
-    start, inputs = PLANT.draw_initial_state(1, generator), PLANT.draw_exogenous(1, generator)
+    start, inputs = drawn(PLANT, 1, 3)
     expected = Rollout(PLANT, PLANT.closure)(start, inputs, asked[None, :, None])
     torch.testing.assert_close(torch.tensor(states).double(), expected.states[0, :-1].detach())
     assert plant.sample == PLANT.n_steps + 1 and not torch.equal(plant._inputs, inputs)
@@ -45,19 +45,6 @@ def test_a_command_that_is_missing_or_wrong_brings_the_safe_action_in_its_interv
         plant.advance([command], float(answered))
         applied.append(plant.published()["applied.force"])
     assert applied == [1.0, 1.5, -0.5, -0.5, -0.5, 1.0]
-
-
-class Time:
-    """A clock that goes on only when somebody waits."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.now += seconds
 
 
 class Line:

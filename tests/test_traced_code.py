@@ -9,6 +9,7 @@ import pytest
 import snippets
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import drawn, seeded
 from torch import nn
 from traced_function import Recurrent, Rows, Snippet, compared, gap, signals, traced
 
@@ -165,9 +166,7 @@ def test_the_engine_parallel_takes_attention():
 
 def cost(plant, engine, rollouts):
     """The cost of a flight, by a rollout that lasts."""
-    generator = torch.Generator().manual_seed(0)
-    scenario = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
-    policy = plant.make_policy(generator)
+    scenario, policy = drawn(plant, 2), plant.make_policy(seeded())
     flown = rollouts.setdefault(engine, Rollout(plant, plant.closure, policy, engine=engine))
     return flown.costs(*scenario).mean().item()
 
@@ -247,11 +246,6 @@ POLICIES = {
 PLANT = LinearQuadratic(horizon=1.0)
 
 
-def scenario(batch=3):
-    generator = torch.Generator().manual_seed(0)
-    return PLANT.draw_initial_state(batch, generator), PLANT.draw_exogenous(batch, generator)
-
-
 @pytest.mark.parametrize("kind", POLICIES)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_policy_that_is_no_function_is_refused(engine, kind):
@@ -261,7 +255,7 @@ def test_a_policy_that_is_no_function_is_refused(engine, kind):
         policy = make()
         for ask in (twin.cost, twin.control):
             with pytest.raises(ImpureError, match=message):
-                ask(policy, *scenario(batch))
+                ask(policy, *drawn(PLANT, batch))
 
 
 @pytest.mark.parametrize("by_steps", [False, True])
@@ -282,10 +276,10 @@ def test_a_policy_in_evaluation_flies_until_it_trains_again(engine, kind):
     policy = make().eval()
     fly = Rollout(PLANT, PLANT.closure, policy, engine=engine)
     exact = Rollout(PLANT, PLANT.closure, policy, engine="autograd")
-    torch.testing.assert_close(fly(*scenario()).states, exact(*scenario()).states)
+    torch.testing.assert_close(fly(*drawn(PLANT, 3)).states, exact(*drawn(PLANT, 3)).states)
     policy.train()
     with pytest.raises(ImpureError, match=message):
-        fly(*scenario())
+        fly(*drawn(PLANT, 3))
 
 
 class Noisy(LinearQuadratic):
@@ -303,6 +297,6 @@ def test_a_plant_or_cost_that_is_no_function_is_refused(engine):
     message = f"a method of plant 'linear_quadratic' {AGAIN}"
     shaken, noisy = Shaken(horizon=1.0), Noisy(horizon=1.0)
     with pytest.raises(ImpureError, match=message):
-        Rollout(shaken, shaken.closure, engine=engine)(*scenario(), torch.zeros(3, 10, 1).double())
+        Rollout(shaken, shaken.closure, engine=engine)(*drawn(PLANT, 3), torch.zeros(3, 10, 1).double())
     with pytest.raises(ImpureError, match=message):
-        Rollout(noisy, noisy.closure, noisy.make_policy(torch.Generator()), engine=engine).costs(*scenario())
+        Rollout(noisy, noisy.closure, noisy.make_policy(torch.Generator()), engine=engine).costs(*drawn(PLANT, 3))

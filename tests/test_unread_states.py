@@ -8,7 +8,7 @@ import torch
 from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
-from seeds_and_numbers import seeded
+from seeds_and_numbers import drawn, seeded
 from small_runs import SMALL
 from test_classical import PD
 from test_export_controller import InC
@@ -107,8 +107,7 @@ def test_state_feedback_acts_on_readings(kind):
         controller = PD(BASE)
     else:
         controller = PredictiveControl(BASE, BASE.closure, PredictiveConfig(horizon=0.5))
-    generators = seeded(1)
-    state, exogenous = plant.draw_initial_state(2, generators), plant.draw_exogenous(2, generators)
+    state, exogenous = drawn(plant, 2, 1)
     flown = controller.fly(state, exogenous, plant=plant)
     assert flown.states.shape == (2, 21, 5)
     controller.begin()
