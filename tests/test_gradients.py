@@ -1,4 +1,4 @@
-"""The gradient engines against each other, of which the continuous adjoint integrates the field by itself."""
+"""The gradient engines against each other and against central differences."""
 
 import pytest
 import torch
@@ -62,7 +62,8 @@ class Case:
         self.initial_state = plant.draw_initial_state(batch, generator)
         self.exogenous = plant.draw_exogenous(batch, generator)
         low, high = bounds(plant.actions)
-        # Off the ends of the ranges: the tank's valve is laminar within 100 Pa of shut.
+        # Off the ends of the ranges: the tank's valve is laminar within 100 Pa of shut, which the step of a central
+        # difference does not resolve.
         share = 0.1 + 0.8 * torch.rand(batch, plant.n_steps, len(plant.actions), generator=generator).double()
         self.command = low + share * (high - low) if driver == "commands" else None
         self.state_scale = 1.0 + self.initial_state.abs().amax(0)
@@ -97,21 +98,38 @@ class Case:
         return (torch.arange(1.0, 1 + len(costs)).double() * costs).sum() + projected / self.plant.n_steps
 
     def leaves(self):
-        """Tensors that a gradient can be taken by, by name."""
-        found = {"initial_state": self.initial_state, "exogenous": self.exogenous}
+        """Tensors that a gradient can be taken by, by name, with the size of a typical change."""
+        found = {
+            "initial_state": (self.initial_state, self.state_scale),
+            "exogenous": (self.exogenous, 1.0 + self.exogenous.abs().mean((0, 1))),
+        }
         if self.command is not None:
-            found["command"] = self.command
+            found["command"] = (self.command, self.action_scale)
         for role, module in (("closure", self.closure), ("policy", self.policy)):
             weights = [] if module is None else [pair for pair in module.named_parameters() if pair[1].requires_grad]
             for name, weight in weights:
-                found[f"{role}.{name}"] = weight
+                found[f"{role}.{name}"] = (weight, torch.ones((), dtype=torch.float64))
         return found
 
     def gradients(self, engine):
         """The cost and its gradients, by name; zero by a weight that is not used."""
-        leaves, cost = {name: leaf.requires_grad_() for name, leaf in self.leaves().items()}, self.cost(engine)
+        leaves, cost = (
+            {name: leaf.requires_grad_() for name, (leaf, _) in self.leaves().items()},
+            self.cost(engine),
+        )
         found = torch.autograd.grad(cost, leaves.values(), allow_unused=True, materialize_grads=True)
         return {"cost": cost.detach(), **dict(zip(leaves, found, strict=True))}
+
+    @torch.no_grad()
+    def difference(self, name, direction, step):
+        """Central difference of the cost along a direction of one leaf."""
+        leaf, scale = self.leaves()[name]
+        costs = []
+        for sign in (1.0, -1.0):
+            leaf += sign * step * scale * direction
+            costs.append(self.cost().item())
+            leaf -= sign * step * scale * direction
+        return (costs[0] - costs[1]) / (2.0 * step)
 
 
 def relative_gap(found, reference):
@@ -137,13 +155,25 @@ LONE = [("own", "commands", 1), ("own", "policy", 1)]
     + [("linear_quadratic", *case) for case in LONE]
     + [pytest.param(plant, *case, marks=pytest.mark.slow) for plant in OUTPUTS for case in LONE],
 )
-def test_exact_engines_equal_autograd(plant, closure, driver, batch):
+def test_exact_engines_equal_autograd_and_differences(plant, closure, driver, batch):
     case = Case(PLANTS[plant](), closure, driver, batch)
     exact = case.gradients("autograd")
     for engine in ("parallel", "native"):
         assert_equal(case.gradients(engine), exact)
+    generator, value = seeded(9), exact.pop("cost").item()
+    walk = case.plant.n_steps**0.5 * (exact["initial_state"] * case.initial_state).abs().sum().item()
     for name, gradient in exact.items():
         assert gradient.any() or not gradient.numel(), name
+        leaf, scale = case.leaves()[name]
+        direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
+        # Error of the central difference: step² times the third derivative, 1e-10 of the norm of the gradient (not of
+        # the directional derivative, which may cancel), and rounding over the step: some of the cost, and one of the
+        # state in every interval, a random walk (the tank's pressure is 5e5 Pa and moves by 10 Pa an interval).
+        slope = (gradient * scale * direction).sum().item()
+        size = (gradient * scale * direction).norm().item()
+        rounding = torch.finfo(torch.float64).eps * (4.0 * abs(value) + walk) / 1e-5
+        tolerance = 1e-6 * size + rounding
+        assert slope == pytest.approx(case.difference(name, direction, 1e-5), rel=0, abs=tolerance), name
 
 
 @pytest.mark.parametrize("driver", ["commands", "policy"])

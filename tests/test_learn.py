@@ -231,22 +231,6 @@ def test_a_loss_of_ones_own():
     assert reports[0] == pytest.approx(2.0 * reports[1], rel=1e-12)
 
 
-def test_a_relaxed_critic_takes_a_share_of_its_step_and_is_its_own_target():
-    """Line 17 of the paper's algorithm, w ← τ w + (1 − τ) w', w' ← w."""
-    found = [learner("relaxed_ddpg", target_rate=rate, critic_iterations=1, actor_iterations=0) for rate in (0.25, 1.0)]
-    steps = []
-    for one in found:
-        filled(explored(20), one)
-        before = torch.cat([w.detach().flatten() for w in one.critic_adam.weights])
-        one.update()
-        steps.append(torch.cat([w.detach().flatten() for w in one.critic_adam.weights]) - before)
-        assert one.target is None
-        observation, action = torch.ones(3, 2, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)
-        assert torch.equal(values(one, observation, action), values(one, observation, action, target=True))
-    assert steps[1].abs().max() > 5e-4  # Adam's first step is its rate
-    torch.testing.assert_close(steps[0], 0.25 * steps[1], rtol=1e-9, atol=1e-15)
-
-
 @pytest.mark.parametrize("algorithm", METHODS)
 def test_priorities_are_sizes_of_errors_whatever_the_loss_reports(algorithm):
     """Where rewards dominate the values, |δ| grows as they do, and δ² would as their squares."""

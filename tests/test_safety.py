@@ -9,7 +9,6 @@ import torch
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from tensordict.nn import TensorDictModule
-from test_algorithm import twinning
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -161,20 +160,6 @@ def test_a_log_on_a_full_disk_does_not_stop_a_machine_that_moves():
     with pytest.raises(OSError, match="No space left"):
         env.reset()
     env.reset()  # once is enough
-
-
-def test_reinforcement_twinning_learns_from_what_was_applied():
-    plant = LinearQuadratic(horizon=2.0)
-    env = layer(PlantEnv(plant, seed=0), rates=(1.0,))
-    found = twinning(plant, env=env)
-    report = found.episode()
-    assert report["J_p"].isfinite() and env.report.counts["rate"] > 0
-    record = found.short_term[-1]
-    assert record.actions.diff(dim=0).abs().max() <= 0.1 + 1e-14
-    held = {event.step: event.applied for event in env.report.events}
-    for k, value in held.items():
-        assert record.actions[k].tolist() == value
-    assert torch.equal(found.learner.memory.buffer[:]["action"], found.learner.actor.scaled(record.actions))
 
 
 def test_specs_hold_around_both_kinds_of_systems():
