@@ -145,6 +145,7 @@ class GainScheduled(nn.Module):
                 'the turbine with observe=("scheduled",).'
             )
         self._places = [names.index(name) for name in self.SEES]
+        self._names = tuple(self.NOMINAL)
         share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
         self.weights = nn.Parameter(math.log(2.0) * (2.0 * share - 1.0))
         self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
@@ -157,7 +158,7 @@ class GainScheduled(nn.Module):
 
     def gains(self) -> dict[str, Tensor]:
         """The gains by name, in the units of ``NOMINAL``."""
-        return dict(zip(self.NOMINAL, (self.nominal * torch.exp(self.weights)).unbind(), strict=True))
+        return dict(zip(self._names, (self.nominal * torch.exp(self.weights)).unbind(), strict=True))
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch 2"]:
         above, rate, pitch = (observation[..., place] for place in self._places)
