@@ -109,7 +109,7 @@ def test_the_gradient_is_that_of_the_same_end(engine):
 
 def test_an_engine_that_integrates_the_field_is_refused():
     plant = Falling()
-    with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use native"):
+    with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use one of native"):
         Rollout(plant, plant.closure, LinearGain(WEAK), engine="odeint_adjoint")
     with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
         CommandCost(plant, plant.closure, 10)
