@@ -9,16 +9,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 from torch import Tensor, nn
 from torch.utils.benchmark import Timer
 
-from rt_torchrl import Engine, Plant, Rollout, SaturatedMLP, Scenario, configuration, main_of, shipped_plants
 from rt_torchrl.atomic_file import make_folder, write_json
 from rt_torchrl.options import AtLeastOne, File, Positive
 from rt_torchrl.trajectories.rollout import refusal
@@ -34,7 +33,7 @@ HIDDEN = (32, 32)
 COLOURS = {"native": "#D55E00", "parallel": "#0072B2", "odeint_adjoint": "#009E73", "autograd": "#222222"}
 
 
-@configuration
+@rt.configuration
 class Config:
     """Time J_a and its gradient by the policy's weights by the gradient engines.
 
@@ -55,7 +54,7 @@ class Config:
     policy: Policy = "affine"
     horizons: tuple[AtLeastOne, ...] = (100, 1_000, 10_000)
     realisations: tuple[AtLeastOne, ...] = (5, 25)
-    engines: tuple[Engine, ...] = get_args(Engine)
+    engines: tuple[rt.Engine, ...] = get_args(rt.Engine)
     threads: AtLeastOne = 1
     repeats: AtLeastOne = 5
     limit: Positive = 2.0
@@ -71,7 +70,7 @@ class Config:
 class System(NamedTuple):
     """A plant with a closure and a policy of random weights; those of the closure are fixed, as when one plans."""
 
-    plant: Plant
+    plant: rt.Plant
     closure: nn.Module
     policy: nn.Module
 
@@ -83,7 +82,7 @@ class Calls(NamedTuple):
     gradient: Callable[[], Tensor]
 
 
-Contender = Callable[[Scenario], Calls]
+Contender = Callable[[rt.Scenario], Calls]
 
 
 class Row(NamedTuple):
@@ -104,9 +103,9 @@ class Row(NamedTuple):
     gap: float
 
 
-def plant_of(name: PlantName, steps: int = 100) -> Plant:
+def plant_of(name: PlantName, steps: int = 100) -> rt.Plant:
     """A plant, with episodes of this many control intervals."""
-    kind = shipped_plants()[name]
+    kind = rt.shipped_plants()[name]
     dt = STEPS_OF.get(name) or kind().dt
     return kind(dt=dt, horizon=steps * dt)
 
@@ -117,15 +116,15 @@ def system_of(name: PlantName, policy: Policy) -> System:
     closure = plant.make_closure(generator).requires_grad_(False)
     if policy == "affine":
         return System(plant, closure, plant.make_policy(generator))
-    made = SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
+    made = rt.SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
     return System(plant, closure, made)
 
 
-def engine_of(engine: Engine, system: System) -> Contender:
+def engine_of(engine: rt.Engine, system: System) -> Contender:
     """An engine of the library, called as a planner calls it."""
-    rollout, weights = Rollout(*system, engine=engine), list(system.policy.parameters())
+    rollout, weights = rt.Rollout(*system, engine=engine), list(system.policy.parameters())
 
-    def calls(scenario: Scenario) -> Calls:
+    def calls(scenario: rt.Scenario) -> Calls:
         @torch.no_grad()
         def forward() -> float:
             return rollout.costs(*scenario).mean().item()
@@ -147,7 +146,7 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
     contenders |= {peer: make(system) for peer, make in peers.items()}
     for steps, batch in sorted(itertools.product(config.horizons, config.realisations), key=math.prod):
         plant, generator = plant_of(name, steps), torch.Generator().manual_seed(1)
-        scenario = Scenario(plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator))
+        scenario = rt.Scenario(plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator))
         calls = {
             contender: made(scenario)
             for contender, made in contenders.items()
@@ -237,4 +236,4 @@ def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | No
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

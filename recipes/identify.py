@@ -5,28 +5,18 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 import tyro
 
-from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, configuration, main_of, read_log
 from rt_torchrl.atomic_file import finite, make_folder, new_folder, write_json
+from rt_torchrl.fit import resampling
 from rt_torchrl.fit.least_squares import Identified, identify
 from rt_torchrl.fit.log import Column, checked, pandas
-from rt_torchrl.fit.resampling import (
-    ROUNDING,
-    Resampled,
-    filled,
-    hold_out,
-    initial_spread,
-    logged_readings,
-    resample,
-    sensors_in,
-)
 from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.options import Count, Positive
 from rt_torchrl.runs.command_line import plant_class
@@ -36,7 +26,7 @@ SHOWN = ("before", "after", "standard_error")
 """What the terminal shows of a weight."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Train a plant's twin on a recorded log, without control.
 
@@ -74,13 +64,13 @@ class Config:
     held_out: float = 0.25
     seed: Count = 0
     log_dir: Path | None = None
-    estimation: EstimationConfig = field(default_factory=lambda: EstimationConfig(errors="robust"))
+    estimation: rt.EstimationConfig = field(default_factory=lambda: rt.EstimationConfig(errors="robust"))
 
     def __post_init__(self):
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder of its own for the results.")
 
-    def make_plant(self) -> Plant:
+    def make_plant(self) -> rt.Plant:
         """The plant with the requested control interval."""
         make = plant_class(self.plant)
         try:
@@ -128,16 +118,18 @@ def main(config: Config) -> None:
 
     plant = config.make_plant()
     columns = [Column.parse(text) for text in config.columns]
-    log = checked(read_log(config.log, plant, columns), plant, drop=config.drop, missing=config.missing)
-    parts = resample(filled(log, plant, config.guesses()), plant, gap=config.gap, shortest=config.shortest)
-    split = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
+    log = checked(rt.read_log(config.log, plant, columns), plant, drop=config.drop, missing=config.missing)
+    parts = resampling.resample(
+        resampling.filled(log, plant, config.guesses()), plant, gap=config.gap, shortest=config.shortest
+    )
+    split = resampling.hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    sensors = with_biases(sensors_in(plant, log, config.sensors), config.biased)
-    spread = initial_spread(plant, log)
-    task = Estimation(DigitalTwin(plant, closure), sensors, spread=spread, config=config.estimation)
-    records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
+    sensors = with_biases(resampling.sensors_in(plant, log, config.sensors), config.biased)
+    spread = resampling.initial_spread(plant, log)
+    task = rt.Estimation(rt.DigitalTwin(plant, closure), sensors, spread=spread, config=config.estimation)
+    records = [[resampling.logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
     found = identify(task, *records)
     described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
     metrics = {"plant": plant.name} | metrics_of(found) | {"log": described, "config": dataclasses.asdict(config)}
@@ -184,7 +176,7 @@ def metrics_of(found: Identified) -> dict[str, Any]:
     return finite(summary | {"warnings": estimate.warnings()})
 
 
-def held_back(plant: Plant, segments: list[Trajectory]) -> dict[str, float]:
+def held_back(plant: rt.Plant, segments: list[rt.Trajectory]) -> dict[str, float]:
     """Share of the control intervals in which the plant's actuators would not have applied the logged action.
 
     In these intervals the action that the actuators allow drives the twin. They are a sign of wrong rate limits, units
@@ -197,7 +189,7 @@ def held_back(plant: Plant, segments: list[Trajectory]) -> dict[str, float]:
     return dict(zip((a.name for a in plant.actions), torch.cat(found).double().mean(0).tolist(), strict=True))
 
 
-def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
+def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) -> str:
     """The parts and gaps of the log, for the terminal."""
     steps = [len(segment.actions) for segment in parts.segments]
     lines = [
@@ -206,7 +198,7 @@ def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
     ]
     lines += [
         f"  gap from {first:g} to {last:g} s "
-        + (f"(limit {parts.gap:g} s)" if last - first > parts.gap * (1.0 + ROUNDING) else "of rows left out")
+        + (f"(limit {parts.gap:g} s)" if last - first > parts.gap * (1.0 + resampling.ROUNDING) else "of rows left out")
         for first, last in parts.gaps
     ]
     lines += [f"  left out as too short: {first:g} to {last:g} s" for first, last in parts.too_short]
@@ -235,4 +227,4 @@ def table(metrics: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any, Literal
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from study import Training, run_all
 
-from rt_torchrl import LoadedRun, configuration, load_run, main_of
 from rt_torchrl.figures.style import ROLES, TWIN, array, caption, legend_below, panels, role_name
 from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.steps.config import ROLES as POLICIES
@@ -42,7 +41,7 @@ START, HOURS = 540e3, 45.0
 """Pressure that the paper's tank is vented from [Pa], and the time that it takes [h]."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Train what is missing by ``--preset paper``, and draw the paper's figures beside its printed numbers.
 
@@ -121,7 +120,7 @@ def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
 
 
 @torch.no_grad()
-def prediction(run: LoadedRun) -> Figure:
+def prediction(run: rt.LoadedRun) -> Figure:
     """Figures 12b, 16b and 22 d to f: states of the twin against real ones, in unseen episodes of the live policy."""
     believed, flown = run.twin.believed, [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
     again = [believed.replay(one.states[None, 0], one.exogenous[None], one.actions[None]).states[0] for one in flown]
@@ -141,7 +140,7 @@ def prediction(run: LoadedRun) -> Figure:
 
 
 @torch.no_grad()
-def power_over_wind(run: LoadedRun) -> Figure:
+def power_over_wind(run: rt.LoadedRun) -> Figure:
     """Figure 14b: the power coefficient at the wind speeds of unseen episodes, and its greatest mean."""
     figure, ((ax,),) = panels(1, title="Power coefficient where the turbine operates", size=(6.5, 4.5))
     flown = [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
@@ -157,7 +156,7 @@ def power_over_wind(run: LoadedRun) -> Figure:
 
 
 @torch.no_grad()
-def venting(run: LoadedRun) -> Figure:
+def venting(run: rt.LoadedRun) -> Figure:
     """Figure 21: the tank vented from 5.4 bar, and figure 21c, the flow over the pressure."""
     start = run.plant.state_at(torch.tensor([START], dtype=torch.float64))
     flown = run.simulate(run.policy(run.live), initial_state=start[0])
@@ -208,7 +207,7 @@ def main(config: Config) -> None:
         raise ValueError("\n".join(failures))
     metrics = [read_metrics(training.folder) | {"seed": training.seed} for training in trainings]
     costs = [one["summary"]["unseen"][f"J_a_{one['summary']['live']}"]["mean"] for one in metrics]
-    run = load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
+    run = rt.load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
     drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     drawn["prediction"] = prediction(run)
     drawn |= {name: draw(run) for name, draw in OF_A_PLANT.get(config.plant, {}).items()}
@@ -221,4 +220,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

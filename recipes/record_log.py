@@ -5,10 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import numpy as np
 import torch
@@ -16,14 +16,13 @@ import tyro
 from pydantic import Field
 from torch import Tensor, nn
 
-from rt_torchrl import ClassicalController, Plant, configuration, main_of, rk4_step
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.fit.log import SensorLog, logged_states
 from rt_torchrl.runs.command_line import plant_class
 
-CONTROLLERS: dict[str, Callable[[Plant], ClassicalController]] = {
+CONTROLLERS: dict[str, Callable[[rt.Plant], rt.ClassicalController]] = {
     "wind_turbine": JonkmanController,
     "flapping_wing": TrimmedPD,
     "cryogenic_tank": PIValve,
@@ -34,7 +33,7 @@ Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 """A control law: a function from time [s], state and exogenous input to a command. It may have a memory."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Fly one episode of a plant and write the log that a data logger would write.
 
@@ -79,14 +78,14 @@ def main(config: Config) -> None:
     print(f"{len(log.times)} rows of plant {plant.name!r} in {config.log}: {', '.join(log.columns)}")
 
 
-def policy_law(plant: Plant, policy: nn.Module) -> Law:
+def policy_law(plant: rt.Plant, policy: nn.Module) -> Law:
     """A policy of the plant's observation as a control law."""
     return lambda t, state, exogenous: policy(plant.observe(t, state, exogenous))
 
 
 @torch.no_grad()
 def recorded(
-    plant: Plant, law: Law, generator: torch.Generator, *, jitter: float = 0.0, noise: float = 0.0
+    plant: rt.Plant, law: Law, generator: torch.Generator, *, jitter: float = 0.0, noise: float = 0.0
 ) -> SensorLog:
     r"""One episode of the real system under a control loop whose intervals are not quite dt.
 
@@ -133,11 +132,11 @@ def recorded(
 
 
 def _held(
-    plant: Plant, length: float, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, closure: nn.Module
+    plant: rt.Plant, length: float, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, closure: nn.Module
 ) -> Tensor:
     """The state after an interval of any length, over which action and input are held."""
-    return rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, closure), t, state, length)
+    return rt.rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, closure), t, state, length)
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -10,16 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 from pydantic import Field
 from wind_turbine import Config as Turbine
 
-from rt_torchrl import OperationConfig, Plant, SafetyConfig, configuration, main_of
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.options import Positive
 from rt_torchrl.plants.signal import bounds
@@ -30,7 +29,7 @@ SAFE = (2e4, 20.0)
 """Torque [N m] and pitch [deg] that slow the rotor down in any wind, and do not stop it."""
 
 
-@configuration
+@rt.configuration
 class Config(Turbine):
     """Train twin and controllers on a wind turbine at the other end of a protocol, while it operates without a stop.
 
@@ -62,7 +61,7 @@ class ServedPlant:
     ``command.NAME`` and ``answered``, the number of the sample that its commands answer.
     """
 
-    def __init__(self, plant: Plant, safe: tuple[float, ...], *, seed: int = 0):
+    def __init__(self, plant: rt.Plant, safe: tuple[float, ...], *, seed: int = 0):
         kinds = {"state": plant.readings, "exogenous": plant.inputs, "applied": plant.actions}
         self.entries = {kind: [f"{kind}.{signal.name}" for signal in signals] for kind, signals in kinds.items()}
         self.read = ["sample", *(tag for tags in self.entries.values() for tag in tags)]
@@ -153,28 +152,29 @@ async def serve(served: ServedPlant, protocol: str, port: int, period: float) ->
         await stop()
 
 
-def machine(plant: Plant, safe: tuple[float, ...], protocol: str, port: int, period: float, log: Path | None = None):
+def machine(plant: rt.Plant, safe: tuple[float, ...], protocol: str, port: int, period: float, log: Path | None = None):
     """The real system at the other end, which connects at its first reset."""
-    from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, Register, SafetyLayer
 
     served = ServedPlant(plant, safe)
     if protocol == "opcua":
         from asyncua.sync import Client
 
         read, written = ({tag: f"ns=2;s={tag}" for tag in tags} for tags in (served.read, served.written))
-        link = OpcUaLink(partial(Client, f"opc.tcp://{HOST}:{port}"), read, written, timeout=0.8 * period)
+        link = rt.OpcUaLink(partial(Client, f"opc.tcp://{HOST}:{port}"), read, written, timeout=0.8 * period)
     else:
         from pymodbus.client import ModbusTcpClient
 
-        read = {tag: Register(4 * k) for k, tag in enumerate(served.read)}
-        written = {tag: Register(WRITTEN_AT + 4 * k) for k, tag in enumerate(served.written)}
-        link = ModbusLink(ModbusTcpClient(HOST, port=port, timeout=0.8 * period, retries=0), read, written)
+        read = {tag: rt.Register(4 * k) for k, tag in enumerate(served.read)}
+        written = {tag: rt.Register(WRITTEN_AT + 4 * k) for k, tag in enumerate(served.written)}
+        link = rt.ModbusLink(ModbusTcpClient(HOST, port=port, timeout=0.8 * period, retries=0), read, written)
     entries = {key: tags for key, tags in served.entries.items() if tags}
     tags = {"sample": "sample", "answered": "answered"}
-    client = ConnectedPlant(link, entries, served.written[:-1], plant.actions, period=period, **tags)
-    limits = SafetyConfig(interval=plant.dt, ranges={"skipped": (-0.5, 0.5)}, log=log)
-    places = {key: Reading(keys=(key,)) for key in entries}
-    return RealSystem(SafetyLayer(client, limits, fallback=safe), plant, **places, closure=plant.closure, seed=None)
+    client = rt.ConnectedPlant(link, entries, served.written[:-1], plant.actions, period=period, **tags)
+    limits = rt.SafetyConfig(interval=plant.dt, ranges={"skipped": (-0.5, 0.5)}, log=log)
+    places = {key: rt.Reading(keys=(key,)) for key in entries}
+    return rt.RealSystem(
+        rt.SafetyLayer(client, limits, fallback=safe), plant, **places, closure=plant.closure, seed=None
+    )
 
 
 def main(config: Config, **parts: Any) -> None:
@@ -187,12 +187,11 @@ def main(config: Config, **parts: Any) -> None:
             asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
         except (OSError, RuntimeError) as error:  # pymodbus raises a RuntimeError if it cannot listen
             raise ValueError(f"port={config.port} cannot be listened on: {error}") from error
-    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    config = dataclasses.replace(config, asynchronous=True, operation=OperationConfig(continuous=True))
+    config = dataclasses.replace(config, asynchronous=True, operation=rt.OperationConfig(continuous=True))
     env = partial(machine, plant, SAFE, *place)
-    Run(config, plant, env=env, first=JonkmanController, **parts).train()
+    rt.Run(config, plant, env=env, first=JonkmanController, **parts).train()
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

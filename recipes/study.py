@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rt_torchrl import begin_loading
+import rt_torchrl as rt
 
 if __name__ == "__main__":
-    begin_loading()
+    rt.begin_loading()
 
 import torch
 
-from rt_torchrl import Comparison, RunConfig, compare_runs, configuration, main_of
 from rt_torchrl.atomic_file import make_folder, read_json, write_atomically, write_json
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -44,7 +43,7 @@ QUICK_EFFORT = {"starts": 1, "approach": 100, "iterations": 20, "polish": 5}
 """Effort of the search for the optimum with ``quick``."""
 
 
-@configuration
+@rt.configuration
 class Config:
     """Train arms on systems over seeds, and compare their costs with classical controllers and the optimum.
 
@@ -148,7 +147,7 @@ def by_name(argument: str, entries: Sequence[tuple[Any, Any]]) -> dict[str, Any]
 
 
 @functools.cache
-def options_of(recipe: Path, words: tuple[str, ...]) -> RunConfig:
+def options_of(recipe: Path, words: tuple[str, ...]) -> rt.RunConfig:
     """The options of a recipe's command line, which takes some tenths of a second to read."""
     return from_command_line(load_recipe(recipe).Config, words)
 
@@ -169,7 +168,7 @@ class Training:
     seed: int
     folder: Path
 
-    def asked(self) -> RunConfig:
+    def asked(self) -> rt.RunConfig:
         """The options of the run."""
         return dataclasses.replace(options_of(self.recipe, (*EVERY, *self.words)), seed=self.seed, log_dir=self.folder)
 
@@ -358,7 +357,7 @@ def register_ray() -> None:
     register()
 
 
-def overview(comparisons: Sequence[Comparison], key: str) -> str:
+def overview(comparisons: Sequence[rt.Comparison], key: str) -> str:
     """Ratios of every arm to the first one by system, and their geometric mean over the systems, as Markdown."""
     first = comparisons[0].rows[0].name
     numbers = {one.title: one.numbers()["rows"] for one in comparisons if one.rows[0].name == first}
@@ -369,7 +368,7 @@ def overview(comparisons: Sequence[Comparison], key: str) -> str:
     return markdown(["", *arms], [*lines, ["geometric mean (systems)", *means]])
 
 
-def write(config: Config, comparisons: Sequence[Comparison]) -> str:
+def write(config: Config, comparisons: Sequence[rt.Comparison]) -> str:
     """Write study.md, study.json and study.png, and return the text."""
     from rt_torchrl.figures import save_figure
     from rt_torchrl.runs.compare import comparison_figure
@@ -390,7 +389,7 @@ def write(config: Config, comparisons: Sequence[Comparison]) -> str:
     return text
 
 
-def studied(config: Config) -> tuple[list[Comparison], list[str]]:
+def studied(config: Config) -> tuple[list[rt.Comparison], list[str]]:
     """Train what is missing; return the comparison of each system, and what went wrong."""
     trainings, pool = config.trainings(), {"jobs": config.jobs, "backend": config.backend}
     failures = run_all([training for group in trainings.values() for training in group], **pool)
@@ -406,7 +405,7 @@ def studied(config: Config) -> tuple[list[Comparison], list[str]]:
 
 def comparisons_of(
     trainings: "dict[tuple[str, str], list[Training]]", searches: "dict[tuple[str, str], Search]"
-) -> list[Comparison]:
+) -> list[rt.Comparison]:
     """The finished runs of each system by arm, beside the optimum.
 
     The optimum of a class of policies is the least cost that anybody has found: the search by gradients, or a run that
@@ -431,7 +430,7 @@ def comparisons_of(
         if runs:
             optimum = None if search is None else least.get(search.path)
             rows.setdefault(system, []).append(Row(name=arm, runs=runs, optimum=optimum))
-    return [Comparison(system, of_system) for system, of_system in rows.items()]
+    return [rt.Comparison(system, of_system) for system, of_system in rows.items()]
 
 
 def main(config: Config) -> None:
@@ -439,7 +438,7 @@ def main(config: Config) -> None:
     before = known(config.log_dir / "study.json")
     if config.runs and before is not None and not before["config"]["runs"]:
         raise ValueError(f"log_dir={config.log_dir} holds a study of trainings; give the comparison another folder.")
-    comparisons, failures = ([compare_runs(config.runs)], []) if config.runs else studied(config)
+    comparisons, failures = ([rt.compare_runs(config.runs)], []) if config.runs else studied(config)
     if comparisons:
         print(write(config, comparisons))
         print(f"study.md, study.json and study.png in {config.log_dir}")
@@ -448,4 +447,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main_of(Config, main)
+    rt.main_of(Config, main)

@@ -8,18 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.export import c_file
 from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_close
-from rt_torchrl.export.c_file import (
-    TracedFunction,
-    add_function,
-    c_array,
-    called,
-    require_names,
-    signal_table,
-    source_of,
-    traced,
-    write_c,
-)
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.c_source import CSource, literal
@@ -57,9 +47,9 @@ def export_controller(policy: nn.Module, path: Path | str, plant: Plant, *, name
             or the controller in C differs from that in torch.
     """
     name = f"{plant.name}_controller" if name is None else name
-    path = require_names(path, name)
+    path = c_file.require_names(path, name)
     written = CController(Controller(plant, detached(policy, plant)), name)
-    return write_c(path, name, written.comment(), written.declarations(), written.source(), written.fly)
+    return c_file.write_c(path, name, written.comment(), written.declarations(), written.source(), written.fly)
 
 
 class CController:
@@ -85,11 +75,11 @@ class CController:
 
     def source(self) -> CSource:
         """The functions ``init`` and ``step``, and those that they call."""
-        name, source = self.name, source_of("policy", self.controller.policy)
+        name, source = self.name, c_file.source_of("policy", self.controller.policy)
         dt, places = literal(self.controller.plant.dt), dict.fromkeys(("measured", "last"), self.read)
         calls = {}
         for part, (function, example) in self.parts.items():
-            head = add_function(source, f"{name}_{part}", function, example, places, kind="static void")
+            head = c_file.add_function(source, f"{name}_{part}", function, example, places, kind="static void")
             given = {"memory": "0", "last": "0", "next": "state->memory"}  # 0 where there is no such array
             given |= {array: f"state->{array}" for array in self.arrays}
             given["t"] = f"{dt} * (double)(state->steps - 1)" if part == "advance" else f"{dt} * (double)state->steps"
@@ -137,7 +127,7 @@ class CController:
             "init is called once, before the first step. step is called at the start of every control interval, over",
             "which its action is held.",
             "",
-            *signal_table({"measured": self.signals, "action": plant.actions, "state.memory": held}),
+            *c_file.signal_table({"measured": self.signals, "action": plant.actions, "state.memory": held}),
             "",
             "The action is what the actuators make of the command of the policy, such as within rate limits. The",
             "command is in state.command.",
@@ -177,8 +167,8 @@ class CController:
     def _call(
         self, library: ctypes.CDLL, part: str, in_c: Any, measured: Tensor, inputs: Tensor, count: int = 0
     ) -> Tensor:
-        signals = c_array(torch.cat([measured, inputs], -1)[0, self.read].tolist())
-        return called(getattr(library, f"{self.name}_{part}"), [ctypes.byref(in_c), signals], count).unsqueeze(0)
+        signals = c_file.c_array(torch.cat([measured, inputs], -1)[0, self.read].tolist())
+        return c_file.called(getattr(library, f"{self.name}_{part}"), [ctypes.byref(in_c), signals], count).unsqueeze(0)
 
 
 MEMORY = (
@@ -189,7 +179,7 @@ MEMORY = (
 )
 
 
-def _traced(controller: Controller) -> dict[str, tuple[TracedFunction, dict[str, Tensor]]]:
+def _traced(controller: Controller) -> dict[str, tuple[c_file.TracedFunction, dict[str, Tensor]]]:
     """The function ``act``; of a controller with states also ``start`` and ``advance``; examples of their arguments.
 
     Measured states and inputs are one argument, ``measured``; those of the interval before are ``last``.
@@ -211,17 +201,17 @@ def _traced(controller: Controller) -> dict[str, tuple[TracedFunction, dict[str,
         return {"next": controller.advance(t, memory, last[:, :n], last[:, n:], command, following)}
 
     now = {"t": state.new_zeros(1), "memory": state[:, controller.held], "measured": measured}
-    parts = {"act": (traced(what, act, now, controller.policy), now)}
+    parts = {"act": (c_file.traced(what, act, now, controller.policy), now)}
     if not controller.held:
         return parts
-    parts["start"] = traced(what, start, {"measured": measured}), {"measured": measured}
+    parts["start"] = c_file.traced(what, start, {"measured": measured}), {"measured": measured}
     with torch.no_grad():
         given = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
         given["measured"] = measured
         controller.closure = unknown = UnknownClosure(plant.closure)
         try:
             advance(**given)
-            parts["advance"] = traced(what, advance, given, prepare=unknown.begin), given
+            parts["advance"] = c_file.traced(what, advance, given, prepare=unknown.begin), given
         finally:
             controller.closure = plant.closure
     if parts["advance"][0].reads("closure"):

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.export import c_file
 from rt_torchrl.export.agreement import (
     SEED,
     detached,
@@ -16,15 +17,6 @@ from rt_torchrl.export.agreement import (
     require_policy,
     sample_observations,
     sizes,
-)
-from rt_torchrl.export.c_file import (
-    add_function,
-    answers,
-    require_names,
-    signal_table,
-    source_of,
-    traced,
-    write_c,
 )
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
@@ -60,24 +52,24 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
             message names the line), the file does not compile, or the function does not agree with the policy.
     """
     name = f"{plant.name}_policy" if function is None else function
-    path, policy = require_names(path, name), detached(policy, plant)
-    source = source_of("policy", policy)
+    path, policy = c_file.require_names(path, name), detached(policy, plant)
+    source = c_file.source_of("policy", policy)
     example = {"observation": sample_observations(plant.observations, 1)}
     what = f"policy {type(policy).__name__}"
-    program = traced(what, lambda observation: {"action": policy(observation)}, example, policy)
-    head = add_function(source, name, program, example)
+    program = c_file.traced(what, lambda observation: {"action": policy(observation)}, example, policy)
+    head = c_file.add_function(source, name, program, example)
 
     def compare(library: ctypes.CDLL) -> float:
-        compiled = getattr(library, name)
-        return require_policy(
-            policy, lambda rows: answers(compiled, {"observation": rows}, len(plant.actions)), plant, "the C function"
-        )
+        def compiled(rows: Tensor) -> Tensor:
+            return c_file.answers(getattr(library, name), {"observation": rows}, len(plant.actions))
+
+        return require_policy(policy, compiled, plant, "the C function")
 
     macros = [
         f"#define {name.upper()}_OBSERVATIONS {len(plant.observations)}",
         f"#define {name.upper()}_ACTIONS {len(plant.actions)}",
     ]
-    return write_c(path, name, _about_policy(policy, plant, name), [*macros, "", f"{head};"], source, compare)
+    return c_file.write_c(path, name, _about_policy(policy, plant, name), [*macros, "", f"{head};"], source, compare)
 
 
 def _about_policy(policy: nn.Module, plant: Plant, name: str) -> list[str]:
@@ -89,7 +81,7 @@ def _about_policy(policy: nn.Module, plant: Plant, name: str) -> list[str]:
         "It has no memory, allocates nothing, may be called from several threads, and needs only math.h.",
         "A NaN in an observation gives NaN in every action that depends on it: check your sensors before.",
         "",
-        *signal_table({"observation": plant.observations, "action": plant.actions}),
+        *c_file.signal_table({"observation": plant.observations, "action": plant.actions}),
         *(f"observation[{k}] is {m.scaling}." for k, m in enumerate(plant.observed) if m.scaling),
         "",
         f"Observations are made of states and inputs by {kind.__name__}.observe, in {kind.__module__}.",
@@ -124,7 +116,7 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
             line), the file does not compile, or the function does not agree with the plant.
     """
     name = f"{plant.name}_twin" if name is None else name
-    path, plant, closure = require_names(path, name), frozen(plant), frozen(closure)
+    path, plant, closure = c_file.require_names(path, name), frozen(plant), frozen(closure)
     points, ends = _flights(plant, closure)
 
     def step(**given: Tensor) -> dict[str, Tensor]:
@@ -137,17 +129,17 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
     if plant.unread:
         read = points["state"][:, : len(plant.readings)]
         functions[f"{name}_rest"] = (rest, {"read": read}, plant.at_rest(read).detach())
-    source = source_of("closure", closure)
+    source = c_file.source_of("closure", closure)
     heads = []
     for called, (function, given, _) in functions.items():
         example = {argument: x[:1] for argument, x in given.items()}
-        part = traced(f"the twin of plant {plant.name!r}", function, example, closure)
-        heads.append(add_function(source, called, part, example))
+        part = c_file.traced(f"the twin of plant {plant.name!r}", function, example, closure)
+        heads.append(c_file.add_function(source, called, part, example))
 
     def compare(library: ctypes.CDLL) -> float:
         errors = []
         for called, (_, given, expected) in functions.items():
-            values = answers(getattr(library, called), given, len(plant.states))
+            values = c_file.answers(getattr(library, called), given, len(plant.states))
             rows = [
                 dict(zip(given, row, strict=True)) for row in zip(*(x.tolist() for x in given.values()), strict=True)
             ]
@@ -155,7 +147,9 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
             errors.append(require_close(values, expected, sizes(expected), TOLERANCE, plant.states, what, rows))
         return max(errors)
 
-    return write_c(path, name, _about_twin(plant, closure, name), [f"{head};" for head in heads], source, compare)
+    return c_file.write_c(
+        path, name, _about_twin(plant, closure, name), [f"{head};" for head in heads], source, compare
+    )
 
 
 @torch.no_grad()
@@ -191,5 +185,5 @@ def _about_twin(plant: Plant, closure: nn.Module, name: str) -> list[str]:
         "math.h. A state that leaves the range of a table becomes NaN.",
         "",
         *(rest if plant.unread else []),
-        *signal_table({"state": plant.states, "command": plant.actions, "exogenous": plant.inputs}),
+        *c_file.signal_table({"state": plant.states, "command": plant.actions, "exogenous": plant.inputs}),
     ]

@@ -11,12 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import (
-    Baseline,
-    Judged,
-    TwinEpisodes,
-    UnseenEpisodes,
-)
+from rt_torchrl.evaluation.unseen import Baseline, Judged, TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics

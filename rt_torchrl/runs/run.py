@@ -16,26 +16,13 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
-from rt_torchrl.evaluation.unseen import (
-    Baseline,
-    Judged,
-    RealController,
-    RealEpisodes,
-    mean_with_confidence,
-)
+from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, mean_with_confidence
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import real_side, results
 from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress
-from rt_torchrl.runs.real_side import (
-    end_operation,
-    judged_on,
-    learner_threads,
-    operation_of,
-    simulated,
-)
 from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
@@ -46,6 +33,7 @@ from rt_torchrl.steps.plan import MakePlanner, make_planner
 from rt_torchrl.steps.start import first_live
 from rt_torchrl.steps.switch import MakeReferee, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
+from rt_torchrl.systems.operation import Operation
 from rt_torchrl.systems.preflight import check_record
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -119,17 +107,17 @@ class Run:
         if config.start == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
         self._start = start_of(config, physics, first)
-        if threads := learner_threads(config):
+        if threads := real_side.learner_threads(config):
             torch.set_num_threads(threads)
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
             if real is None:
-                make_env = functools.partial(simulated, plant, config, first, device=device)
-            system = real or simulated(plant, config, first, device=device)
+                make_env = functools.partial(real_side.simulated, plant, config, first, device=device)
+            system = real or real_side.simulated(plant, config, first, device=device)
             make_learner = learner or functools.partial(ActorCritic, replay=replay)
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector, device=device)
-            self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device)
+            self.unseen = real_side.judged_on(plant, self.algorithm.twin, real, self.config, device=device)
             self._real, self._device = real, device
             made = {name: law(physics) for name, law in laws.items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
@@ -147,7 +135,7 @@ class Run:
 
     def _make_algorithm(
         self,
-        env: EnvBase,
+        env: EnvBase | Operation,
         make_env: Callable[[], EnvBase] | None,
         physics: Plant,
         makers: tuple[MakeLearner, MakePlanner, MakeReferee],
@@ -164,8 +152,10 @@ class Run:
         first = self._start(physics, closure)
         table, twin = config.twinning, twin_of(config, physics, closure, first)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
+        if config.asynchronous:
+            env = real_side.operation_of(config, env, make_env, physics, policies, first=first)
         self.algorithm = ReinforcementTwinning(
-            operation_of(config, env, make_env, physics, policies, first=first) if config.asynchronous else env,
+            env,
             twin,
             model_free=policies["model_free"],
             model_based=policies["model_based"],
@@ -212,7 +202,7 @@ class Run:
                 print(f"{how}: {done} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
-            end_operation(self.algorithm)
+            real_side.end_operation(self.algorithm)
             self._held.release()
 
     def _train(self) -> dict[str, Any]:
@@ -231,7 +221,7 @@ class Run:
             if not self.episodes:
                 raise Interrupted("interrupted before the first episode was done; nothing to report.")
             self._drop_half_an_episode()
-            end_operation(self.algorithm)
+            real_side.end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
             self._follow_wear()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}

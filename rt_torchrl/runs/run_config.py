@@ -11,19 +11,9 @@ import torch
 from pydantic import Field
 from torch import nn
 
+from rt_torchrl import options
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.fit.log import LogConfig
-from rt_torchrl.options import (
-    AtLeastOne,
-    Count,
-    File,
-    NotNegative,
-    Text,
-    Widths,
-    choices,
-    configuration,
-    require_checked,
-)
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.steps.config import PAPER, Role, TwinningConfig
@@ -53,7 +43,7 @@ GREATEST_SEED = 2**63 - 2
 """Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
 
 
-@configuration
+@options.configuration
 class RunConfig:
     """The options that every recipe has.
 
@@ -110,32 +100,32 @@ class RunConfig:
 
     preset: Preset = "default"
     policy: Literal["plant", "mlp"] = "plant"
-    hidden: Widths = (32, 32)
+    hidden: options.Widths = (32, 32)
     closure: Literal["plant", "mlp"] = "plant"
-    episodes: AtLeastOne = 20
+    episodes: options.AtLeastOne = 20
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = 0
     engine: Engine = "native"
     device: str = "cpu"
-    threads: Count = 0
-    start: Text = "random"
+    threads: options.Count = 0
+    start: options.Text = "random"
     log: LogConfig = field(default_factory=LogConfig)
-    config: File | None = None
-    log_dir: File | None = None
+    config: options.File | None = None
+    log_dir: options.File | None = None
     resume: bool = False
     quick: bool = False
     unseen: Annotated[int, Field(ge=2)] = 20
-    real_unseen: Count = 0
+    real_unseen: options.Count = 0
     preflight: bool = True
     reference: bool = False
     figures: bool = True
-    unseen_every: Count = 0
-    noise: NotNegative = 0.0
+    unseen_every: options.Count = 0
+    noise: options.NotNegative = 0.0
     asynchronous: bool = False
     operation: OperationConfig = field(default_factory=OperationConfig)
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
     def __post_init__(self) -> None:
-        require_checked(type(self))
+        options.require_checked(type(self))
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.real_unseen == 1:  # no mean of one episode has a confidence interval
@@ -152,7 +142,7 @@ class RunConfig:
 
         Override this method, and the ``Literal`` that declares ``policy``, for policies of your own.
         """
-        if not choices(type(self), "policy") and self.policy not in ("plant", "mlp"):
+        if not options.choices(type(self), "policy") and self.policy not in ("plant", "mlp"):
             raise ValueError(f"policy={self.policy!r} does not exist; choose plant or mlp, or override make_policy.")
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
