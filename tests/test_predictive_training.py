@@ -99,7 +99,7 @@ def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path, monkeypatch)
     assert controller.state_dict().keys() == own.state_dict().keys()
     assert all(torch.equal(value, own.state_dict()[name]) for name, value in controller.state_dict().items())
     export = recipe("export")
-    monkeypatch.setattr(export, "load_run", lambda folder, _: load_run(folder, Config))
+    monkeypatch.setattr(export.rt, "load_run", lambda folder, _: load_run(folder, Config))
     for what in ("policy", "controller"):
         with pytest.raises(ValueError, match="cannot be exported. Export the model-free policy.*--role model_free"):
             export.main(export.Config(run=tmp_path, what=(what,), formats=("c",)))
