@@ -284,14 +284,20 @@ class Clearance:
             policy, share = self.policies[role], 0.0
             if episodes is not None:
                 share = self.predicted(policy, episodes)
-            left = f"it would leave the limits in {100.0 * share:.3g} % of the intervals"
-            reason = left if share > 0.0 else self._dearer(policy)
-            if not reason and episodes is None:
+            known = None if self.controller is None else self.belief.beside_first(policy)
+            if share > 0.0:
+                refused.append(f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals")
+            elif known is not None and known[0] > TWICE * known[1]:
+                expected, paid = map(in_words, known)
+                refused.append(
+                    f"{role} may not act: it is expected to cost {expected} where the controller that flew first cost "
+                    f"{paid}"
+                )
+            elif episodes is None:
                 return Cleared(policy, role, findings(*refused))
-            if not reason:
+            else:
                 self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
                 return Cleared(policy, role, findings(*refused, predicted_violations=share))
-            refused.append(f"{role} may not act: {reason}")
         if self.controller is not None:
             return Cleared(self.controller, FIRST, findings(*refused))
         if self._last is None:
@@ -305,14 +311,6 @@ class Clearance:
         share = self.predicted(policy, episodes)
         return Cleared(policy, role, findings(*refused, predicted_violations=share))
 
-    def _dearer(self, policy: nn.Module) -> str:
-        """Why a policy is too dear to be tried beside the controller that flew first; empty if it is not."""
-        known = None if self.controller is None else self.belief.beside_first(policy)
-        if known is None or known[0] <= TWICE * known[1]:
-            return ""
-        expected, paid = map(in_words, known)
-        return f"it is expected to cost {expected} where the controller that flew first cost {paid}"
-
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
         """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
         try:
@@ -323,8 +321,8 @@ class Clearance:
         return torch.stack(list(broken.values())).any(0).double().mean().item()
 
     def counted(self, flown: Trajectory) -> TensorDict:
-        """Numbers of control intervals of a real episode beyond each kind of limits; nothing without limits."""
-        broken = self.limits.broken(flown) if self.limited else {}
+        """Numbers of control intervals of a real episode beyond each kind of limits."""
+        broken = self.limits.broken(flown)
         return findings(**{f"violations/{kind}": found.sum().double() for kind, found in broken.items()})
 
     def state_dict(self) -> dict[str, Any]:
@@ -399,9 +397,10 @@ class Operating:
         report = report_of_flights(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
         merged(report, findings(**(order.found or {}))).update(findings(**(self.operation.acted or {})))
-        counted = [self.step.clearance.counted(flight.record) for flight in flights]
-        kinds = counted[0].keys()
-        report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
+        if self.step.clearance.limited:
+            counted = [self.step.clearance.counted(flight.record) for flight in flights]
+            kinds = counted[0].keys()
+            report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
         late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
         if late.any():
             period = 1e3 * late
@@ -465,7 +464,9 @@ class Interact(Step):
         flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
         self.keep(flight, cleared.role, self.flights.actor.strength, acting.state_dict())
         report = merged(report_of_flights([flight]), findings(exploration=self.flights.actor.strength))
-        report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
+        report = merged(report, cleared.report)
+        if self.clearance.limited:
+            report.update(self.clearance.counted(flight.record))
         report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
         return [flight], report.set_non_tensor("live", cleared.role)
 
