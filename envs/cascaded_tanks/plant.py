@@ -56,11 +56,17 @@ class CascadedTanks(Plant):
     e     set_point      :math:`(r - 5)/2`                          -      about ±2.5
     ====  =============  =========================================  =====  ==========
 
+    The table shows the first set of observations; ``observe`` chooses others.
+
     Args:
         dt: control interval [s]; the benchmark's is 4.
         horizon: length of an episode T_o [s].
         closure: closure of the real tanks, from (h_1, h_2, u) to the rates of the levels; None for hydraulics as they
             were identified from the benchmark.
+        observe: names of measurements and observation sets.
+
+    Raises:
+        ValueError: if there is no such measurement.
 
     Source: Schoukens and Noël, Three benchmarks addressing open challenges in nonlinear system identification, IFAC
     2017.
@@ -77,10 +83,21 @@ class CascadedTanks(Plant):
         Measurement.of(WANTED, offset=5.0, scale=2.0),
         Measurement(symbol="y", name="sensed_level", unit="V", high=10.0, read=sensed_level, offset=5.0, scale=2.0),
     )
-    observation_sets = {"levels": ("level_error", "lower_level", "upper_level", "set_point")}
+    observation_sets = {
+        "levels": ("level_error", "lower_level", "upper_level", "set_point"),
+        "measured": ("level_error", "sensed_level", "set_point"),
+    }
 
-    def __init__(self, *, dt: float = 4.0, horizon: float = 2048.0, closure: nn.Module | None = None):
-        super().__init__(dt=dt, horizon=horizon, closure=Hydraulics.true() if closure is None else closure)
+    def __init__(
+        self,
+        *,
+        dt: float = 4.0,
+        horizon: float = 2048.0,
+        closure: nn.Module | None = None,
+        observe: Sequence[str] = (),
+    ):
+        law = Hydraulics.true() if closure is None else closure
+        super().__init__(dt=dt, horizon=horizon, closure=law, observe=observe)
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """Rates of the levels.
