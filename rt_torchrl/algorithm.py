@@ -139,7 +139,8 @@ class ReinforcementTwinning(TensorDictSequential):
         collector = env if isinstance(env, Operation) else make_collector(env, actor, twin.plant)
         rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
         flights = RealFlights(env, actor, rollout, twin.plant)
-        clearance = Clearance(system, policies, belief, config.limits, None if first is None else first.teacher)
+        trained = {role: policy for role, policy in policies.items() if config.arm in ("twinning", role)}
+        clearance = Clearance(system, trained, belief, config.limits, None if first is None else first.teacher)
         interact = Interact(env, policies, flights, clearance, belief, config, judged)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):

@@ -176,6 +176,11 @@ def observe_together(self, t, state, exogenous):
     return state - state.mean(dim=tuple(range(state.ndim - 1)) or 0).detach() if state.ndim > 1 else 0.0 * state
 
 
+@breaks("running_cost: cost of a batch differs from that of its rows one by one", "running_cost")
+def cost_at_the_first_time(self, t, state, applied, exogenous):
+    return inherited("running_cost")(self, t, state, applied, exogenous) * (1.0 + t.flatten()[0])
+
+
 @breaks("running_cost: cost has 1 values that are not finite", "running_cost")
 def cost_that_is_no_number(self, t, state, applied, exogenous):
     return state.square().sum(-1) + (state[..., 0] - 1e3).sqrt()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from seeds_and_numbers import double, seeded
 
-from rt_torchrl import DivergenceError, Rollout
+from rt_torchrl import DivergenceError, Rollout, rk4_step
 from rt_torchrl.envs.cryogenic_tank.closures import CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
@@ -148,3 +148,86 @@ def test_costs(plant):
 
 
 # Long runs: figures of a separate calculation
+
+
+class Ledger:
+    """The plant with three more states, integrated by the same step: what has left by the vent, and the heat let in.
+
+    So the integrals of the fluxes have the order of the states. The fluxes are read off the vent and the saturation
+    table; the rates that they are compared with come from the derivatives of the balances.
+    """
+
+    def __init__(self, plant):
+        self.plant = plant
+
+    def field(self, t, state, action, load):
+        rates = self.plant.vector_field(t, state[..., :3], action, load, self.plant.closure)
+        vent = self.plant.vent(state[..., :3], action, self.plant.closure)
+        enthalpy = vent.flow * self.plant.saturation(state[..., 2]).h_l + vent.heat
+        return torch.cat([rates, torch.stack([vent.flow, enthalpy, load[..., 0]], -1)], -1)
+
+    def step(self, state, action, load):
+        return rk4_step(lambda t, s: self.field(t, s, action, load), TIME_ZERO, state, self.plant.dt)
+
+    def mass(self, state):
+        tank, V_l = self.plant.saturation(state[..., 2]), state[..., 1]
+        return tank.rho_l * V_l + tank.rho_v * (V_T - V_l)
+
+    def energy(self, state, heat_capacity=M_C):
+        """Energy H − pV of wall and mixture."""
+        tank, V_l, p = self.plant.saturation(state[..., 2]), state[..., 1], state[..., 2]
+        enthalpy = tank.rho_l * tank.h_l * V_l + tank.rho_v * tank.h_v * (V_T - V_l)
+        return heat_capacity * state[..., 0] + enthalpy - p * V_T
+
+
+@pytest.mark.parametrize(
+    "drop, flow, heat, held",
+    [(25e3, 0.224, 66, 75), (50e3, 0.316, 106, 119), (100e3, 0.447, 162, 180), (200e3, 0.632, 236, 262)],
+)
+def test_vent_at_the_set_point(plant, drop, flow, heat, held):
+    state, action = plant.state_at(double(500e3)), double(drop).unsqueeze(-1)
+    vent = plant.vent(state, action, plant.closure)
+    assert 1e3 * vent.flow.item() == pytest.approx(flow, abs=6e-4)  # half a unit of the last digit
+    assert vent.heat.item() == pytest.approx(heat, abs=0.6)
+    assert plant.held_load(state, action, plant.closure).item() == pytest.approx(held, abs=0.6)
+
+
+@pytest.fixture(scope="module")
+def shut_and_open():
+    """A shut tank at 500 kPa and one at 540 kPa with the valve wide open, under mean loads, over 120 h."""
+    plant = CryogenicTank(dt=240.0)  # nothing changes fast under a constant load
+    return plant, flown(plant, (500e3, 540e3), (0.0, 200e3), (129.0, 128.5), 1800)
+
+
+def assert_balances(ledger, first, last):
+    vented, enthalpy, heat = last[..., 3:].unbind(-1)
+    mass = ledger.mass(first)
+    torch.testing.assert_close(ledger.mass(last) + vented, mass, rtol=1e-8, atol=0)
+    # Relative to the energy that went through the tank, the heat of the load.
+    gap = ledger.energy(last) - ledger.energy(first) - (heat - enthalpy)
+    assert (gap.abs() < 1e-8 * heat).all()
+
+
+@pytest.mark.parametrize("n", [480, pytest.param(14_400, marks=pytest.mark.nightly)])
+@torch.no_grad()
+def test_mass_and_energy_are_conserved(plant, n):
+    ledger, policy = Ledger(plant), plant.make_policy(seeded(2))
+    state = torch.cat([plant.draw_initial_state(3, seeded(1)), torch.zeros(3, 3, dtype=torch.float64)], -1)
+    first, load = state, plant.draw_exogenous(3, seeded(1))
+    for k in range(n):
+        state = ledger.step(state, policy(plant.observe(TIME_ZERO, state[:, :3], load[:, k])), load[:, k])
+    assert state[:, 3].min() > 0.1
+    assert_balances(ledger, first, state)
+
+
+def test_pressure_of_a_shut_tank(shut_and_open):
+    _, states = shut_and_open
+    assert 1e-3 * states[0, -1, 2].item() == pytest.approx(628.0, abs=3.0)
+
+
+def test_vent_wide_open_brings_an_over_pressure_down(shut_and_open):
+    plant, states = shut_and_open
+    k = int((states[1, :, 2] < 500e3).int().argmax())
+    actions = torch.full((1800, 1), 200e3, dtype=torch.float64)
+    assert k * plant.dt / 3600 == pytest.approx(38.0, abs=1.5)
+    assert plant.vented_mass(states[1], actions, plant.closure)[k].item() == pytest.approx(85.0, abs=2.0)

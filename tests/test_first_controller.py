@@ -89,18 +89,48 @@ def test_the_controller_flies_while_policies_are_expected_to_cost_twice_as_much(
 def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
     found = begun()
     found.start()
-    expected, paid = found.belief.beside_first(found.model_based)
     (record,) = found.short_term
-    flown = found.twin.control(found.model_based, record.states[:1], record.exogenous[None])
-    cost = control_cost(found.twin.plant, flown).item()
-    assert expected == pytest.approx(cost) and paid == pytest.approx(control_cost(found.twin.plant, record).item())
+    paid = control_cost(found.twin.plant, record).item()
+
+    def on_twin(policy):
+        flown = found.twin.control(policy, record.states[:1], record.exogenous[None])
+        return control_cost(found.twin.plant, flown).item()
+
+    # Before a policy has flown, the twin errs for it as for the controller; then the belief corrects it.
+    ratio = on_twin(found.model_based) / on_twin(found.first.teacher)
+    expected = pytest.approx((paid * ratio, paid))
+    assert found.belief.beside_first(found.model_based, found.first.teacher) == expected
+    found.belief.append(record, "model_based", paid)
+    corrected = found.belief.expected(found.model_based, on_twin(found.model_based))
+    assert found.belief.beside_first(found.model_based, found.first.teacher) == pytest.approx((corrected, paid))
+
+
+def test_a_twin_that_overstates_costs_refuses_no_clone_of_the_controller():
+    found = begun()
+    found.start()
+    with torch.no_grad():
+        found.twin.closure.matrix.mul_(3.0)
+        found.model_based.gain.copy_(torch.tensor([GAINS]))
+    assert not 0.7 < found.belief.replayed(found.short_term) < 1.4
+    expected, paid = found.belief.beside_first(found.model_based, found.first.teacher)
+    assert expected == pytest.approx(paid, rel=1e-3)
+
+
+def test_a_controller_whose_costs_have_no_ratio_is_named():
+    found = begun()
+    found.start()
+    (record,) = found.short_term
+    with pytest.raises(ValueError, match=r"J_a=-1 of a real episode of plant .* is negative"):
+        found.belief.append_first(record, -1.0)
+    found.belief.first = [found.belief.first[0]._replace(cost=0.0)]
+    assert found.belief.beside_first(found.model_based, found.first.teacher) is None
 
 
 def test_the_twin_alone_knows_no_controller():
     found = begun(referee=RefereeConfig(rule="decision_tree"))
     wild(found)
     found.start()
-    assert found.belief.beside_first(found.model_based) is None
+    assert found.belief.beside_first(found.model_based, found.first.teacher) is None
 
 
 def run(folder, **options):

@@ -272,3 +272,17 @@ def test_an_own_plant_is_made_by_its_file(tmp_path):
     assert own.horizon == faster.horizon
     with pytest.raises(ValueError, match="cannot be made .*blades.*its options must have defaults"):
         identify.Config(log=file, plant=f"{file}:Demanding").make_plant()
+
+
+def test_whole_records_are_fitted_again_from_what_short_segments_tell():
+    """The first fit of whole records stays in a poor minimum, out of which short segments lead."""
+    closure, starts = LinearClosure(torch.zeros(2, 2)), []
+
+    def fit(length):
+        start = closure.matrix[0, 0].item()
+        starts.append((length, start))
+        torch.nn.init.constant_(closure.matrix, length or 10.0 + start)
+        return length, torch.tensor([0.5 if start == 2.0 else 10.0])
+
+    assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 0
+    assert starts == [(0, 0.0), (2, 0.0), (0, 2.0)] and (closure.matrix == 12.0).all()

@@ -8,6 +8,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from printed_commands import blocks
+from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import drawn, seeded
 
@@ -237,3 +238,19 @@ def test_the_code_of_the_page_prints_what_its_table_says(capsys):
     (code,) = [block for block in blocks("planner.md", "python") if "RecedingHorizon" in block]
     exec(compile(code, "docs/planner.md", "exec"), {})
     assert float(capsys.readouterr().out) == pytest.approx(0.01182, abs=1e-5)
+
+
+def test_a_long_horizon_is_the_linear_quadratic_regulator():
+    plant = LinearQuadratic(horizon=3.0, noise=0.0)
+    A, B, _, Q, R = matrices(plant)
+    P = solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    config = PredictiveConfig(horizon=8.0, tolerance=0.0, iterations=500)
+    controller = RecedingHorizon(plant, plant.closure, config)
+    state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
+    flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
+    s = state.numpy().T
+    for k in range(plant.n_steps):
+        np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
+        s = A @ s - B @ K @ s
+    assert len(controller.solves) == 2 * plant.n_steps

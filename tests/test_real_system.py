@@ -329,3 +329,16 @@ def test_a_report_that_is_not_as_declared_is_refused(reported):
     with pytest.raises(ValueError, match="place and rate=.* must be 2 numbers"):
         env.reset()
     env.close()
+
+
+def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
+    def run(folder, episodes, **options):
+        plant = LinearQuadratic(horizon=2.0)
+        return run_on(connected(plant, closure=plant.closure), folder, episodes=episodes, **options).train()
+
+    whole = run(tmp_path / "whole", 3)
+    run(tmp_path / "parts", 2)
+    parts = run(tmp_path / "parts", 3, resume=True)
+    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
+        assert {**one, "seconds": None} == {**other, "seconds": None}
+    assert "true" in whole["summary"]["closure"]

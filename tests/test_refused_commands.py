@@ -93,8 +93,8 @@ def test_a_command_takes_the_type_of_its_node(server):
     [
         ("switch", 1.0, "'switch'.* holds Boolean.*a node of a numeric type"),
         ("text", 1.0, "'text'.* holds String.*a node of a numeric type"),
-        ("whole", 1.5, "'whole' = 1.5 .* Int16: it takes whole numbers"),
-        ("whole", 4e4, "'whole' = 40000 .* Int16: .*requires"),
+        ("whole", 1.5, "'whole' = 1.5 .* Int16, which takes whole numbers from -32768 to 32767; give .* type Double"),
+        ("whole", 4e4, "'whole' = 40000 .* Int16, which takes whole numbers from -32768 to 32767"),
         ("float", 1e39, r"'float' = 1e\+39 .* Float"),
         ("fixed", 1.0, "'fixed' = 1 .*BadUserAccessDenied"),
         ("unknown", 1.0, "'unknown'.*BadNodeIdUnknown"),

@@ -187,8 +187,8 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     live = metrics["summary"]["live"]
     cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
 
-    def said(better, controller, planner="multi_start", **summary):
-        unseen = metrics["summary"]["unseen"] | {"baselines": {"PI": {"J_a": {"mean": controller}}}}
+    def said(better, controller, planner="multi_start", place="simulation", **summary):
+        unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": {"J_a": {"mean": controller}}}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
         return next_steps({"summary": found}, tmp_path, config)
@@ -198,8 +198,10 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
     first = {"expected": 3.0, "paid": 2.0}
-    assert "the controller that flew first is better than the live policy" in said(live, 2.0 * cost, first=first)
-    assert "recipes/export.py" in said(live, 2.0 * cost, first={"expected": 2.0, "paid": 3.0})
+    told = said(live, 2.0 * cost, place="twin", first=first)
+    assert "the controller that flew first is better than the live policy" in told
+    assert "recipes/export.py" in said(live, 2.0 * cost, place="twin", first={"expected": 2.0, "paid": 3.0})
+    assert "recipes/export.py" in said(live, 2.0 * cost, first=first)  # other episodes tell more
     assert dearer_than_first({"first": first | {"expected": None}}).startswith(
         "the live policy is expected to cost - on"
     )

@@ -400,3 +400,13 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     other = unseen.fly(Held())
     assert torch.equal(other.exogenous, found.exogenous)
     assert torch.equal(other.states[:, 0, 0], found.states[:, 0, 0])
+
+
+def test_a_steady_wind_above_rated_is_held_at_rated_speed(controller):
+    plant = controller.plant
+    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
+    flown = controller.fly(state, torch.full((1, 600, 1), 16.0, dtype=torch.float64))
+    # The integral leaves no error; 300 s are eighteen time constants of the rotor.
+    assert plant.gear_ratio * flown.states[0, -1, 0].item() == pytest.approx(controller.reference_speed, rel=1e-3)
+    power = plant.generator_power(flown.states[:, -2], flown.actions[:, -1]).item()
+    assert power == pytest.approx(controller.power, rel=1e-3)

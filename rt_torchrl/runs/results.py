@@ -97,7 +97,8 @@ def summarise(
     before = of_each_role(initial_policies, unseen.control_costs)
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
     after = {role: judged[role].control_costs.mean().item() for role in ROLES}
-    first = algorithm.belief.beside_first(algorithm.policies[live])
+    teacher = None if algorithm.first is None else algorithm.first.teacher
+    first = algorithm.belief.beside_first(algorithm.policies[live], teacher)
     means = {"J_p": J_p, "J_p_before": J_p_before}
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     return {
@@ -443,7 +444,7 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
-    elif (best is not None and cost >= known[best]) or dearer_than_first(found):
+    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(found)):
         better = best if best is not None and cost >= known[best] else "the controller that flew first"
         longer = "go on with --resume and more --episodes, or train with more --twinning.planner.iterations"
         steps.append(f"{better} is better than the live policy: keep it, {longer}")

@@ -176,7 +176,8 @@ def known_physics(
     require_plant("plant", plant)
     require_simulation(config, plant, real, baselines)
     believed = config.believed()
-    physics = believed or plant
+    physics = plant if believed is None else believed
+    require_plant("config.believed()", physics)
     known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
     if known != read:
         raise ValueError(

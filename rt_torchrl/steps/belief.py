@@ -118,6 +118,7 @@ class Belief:
         self.flown: list[Flown] = []
         self.first: list[FirstFlown] = []
         """The latest episodes of the controller that flew first."""
+        self._policy_flew = True
         self._costs: tuple[Any, list[float]] | None = None
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
@@ -138,32 +139,54 @@ class Belief:
             ValueError: if the cost is negative, because differences are logs of the ratio of two costs.
         """
         if cost < 0.0 and self.corrects:
-            raise ValueError(
-                f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training "
-                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
-                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
-            )
+            raise self._negative(cost)
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
-        self._costs = self._anchored = None
+        self._costs, self._anchored, self._policy_flew = None, None, True
+
+    def _negative(self, cost: float) -> ValueError:
+        return ValueError(
+            f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training with "
+            "a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a constant that "
+            "keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
+        )
 
     def append_first(self, trajectory: Trajectory, cost: float) -> None:
-        """Add an episode that the controller has flown with which the training has begun."""
+        """Add an episode that the controller has flown with which the training has begun.
+
+        Raises:
+            ValueError: if the cost is negative.
+        """
+        if cost < 0.0 and self.corrects:
+            raise self._negative(cost)
         self.first = [*self.first, FirstFlown(trajectory, cost)][-ANCHORS:]
+        self._policy_flew = False
 
     @torch.no_grad()
-    def beside_first(self, policy: nn.Module) -> tuple[float, float] | None:
+    def beside_first(self, policy: nn.Module, controller: nn.Module | None) -> tuple[float, float] | None:
         """The cost that is expected of a policy in the episodes of the controller that flew first, and what these cost.
 
-        None where no controller flew first, the twin alone has the word, or the policy is state feedback, which plans
-        on the twin while it acts.
+        Before a policy has flown nothing corrects what the twin says of one. It then errs as it errs for the
+        controller, which it flies in the same episodes.
+
+        Args:
+            policy: the policy.
+            controller: the controller; None where no controller flew first.
+
+        Returns:
+            None where no controller flew first or it cost nothing, the twin alone has the word, or the policy is state
+            feedback, which plans on the twin while it acts.
         """
-        if not (self.corrects and self.first) or isinstance(policy, StateFeedback):
+        paid = sum(one.cost for one in self.first) / max(1, len(self.first))
+        if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
-        costs = [self.virtual.cost(policy, self.virtual.repeated(one.trajectory)) for one in self.first]
-        paid = [one.cost for one in self.first]
-        return self.expected(policy, sum(costs) / len(costs)), sum(paid) / len(paid)
+        episodes = [self.virtual.repeated(one.trajectory) for one in self.first]
+        cost = sum(self.virtual.cost(policy, one) for one in episodes) / len(episodes)
+        if self.flown:
+            return self.expected(policy, cost), paid
+        its = sum(self.virtual.cost(controller, one) for one in episodes) / len(episodes)
+        return (paid * cost / its if 0.0 < its < math.inf else math.inf), paid
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it, until the next call for this role.
@@ -203,10 +226,10 @@ class Belief:
 
         Returns:
             ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1. Nothing if
-            state feedback flew it.
+            state feedback or the controller that flew first flew it.
         """
         found = self.differences()
-        if not found or math.isnan(found[-1]):
+        if not found or math.isnan(found[-1]) or not self._policy_flew:
             return findings()
         quiet = [d for d, one in zip(found, self.flown, strict=True) if one.exploration <= QUIET and not math.isnan(d)]
         said, hypothesis = alarm(quiet), self.virtual.twin.hypothesis

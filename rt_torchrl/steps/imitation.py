@@ -38,8 +38,7 @@ SAMPLES = 5000
 BLOWN_UP = 1e3
 """Observation, which is of order one in a sound flight, beyond which a twin has blown up."""
 TWICE = 2.0
-"""Cost over the controller's beyond which an imitation is not good enough: if it costs so much with extreme episodes,
-it learns from these, too, and if it costs so much in the usual ones, the policy is planned before it flies."""
+"""Cost over the controller's, extreme episodes included, beyond which an imitation learns from these, too."""
 
 
 class Imitation:

@@ -232,13 +232,13 @@ class Cleared(NamedTuple):
 class Clearance:
     """Lets a policy act only if it is expected to keep the limits, and not to cost twice what flew first.
 
-    The live policy is asked first, then the idle one. Where neither may act, the controller does with which the
-    training has begun, or without one the weights that were cleared last. Before the first real episode nothing is
-    known, and the live policy acts unchecked, behind the safety layer.
+    The live policy is asked first, then the idle one. Where neither may act, the weights do that were cleared for the
+    limits last, or without these the controller with which the training has begun. Before the first real episode
+    nothing is known, and the live policy acts unchecked, behind the safety layer.
 
     Args:
         env: the real system, which needs a safety layer if there are limits.
-        policies: both policies by role.
+        policies: the policies that are trained, by role.
         belief: what policies cost, and the virtual episodes.
         config: the limits.
         controller: what the training has begun with; None without.
@@ -272,7 +272,7 @@ class Clearance:
             count: number of virtual episodes of the check.
 
         Returns:
-            What may act. The report holds a reason for each policy that is refused and, with limits,
+            What may act. The report holds a reason for each policy that is refused and, of a policy with limits,
             ``predicted_violations``, the share of control intervals beyond one.
 
         Raises:
@@ -280,11 +280,11 @@ class Clearance:
         """
         episodes = self.virtual.draw(count) if self.limited and self.virtual.processes else None
         refused = list[str]()
-        for role in (live, other_than(live)):
+        for role in (role for role in (live, other_than(live)) if role in self.policies):
             policy, share = self.policies[role], 0.0
             if episodes is not None:
                 share = self.predicted(policy, episodes)
-            known = None if self.controller is None else self.belief.beside_first(policy)
+            known = self.belief.beside_first(policy, self.controller)
             if share > 0.0:
                 refused.append(f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals")
             elif known is not None and known[0] > TWICE * known[1]:
@@ -298,18 +298,17 @@ class Clearance:
             else:
                 self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
                 return Cleared(policy, role, findings(*refused, predicted_violations=share))
+        if self._last is not None and episodes is not None:
+            role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
+            policy.load_state_dict(self._last["weights"])
+            share = self.predicted(policy, episodes)
+            return Cleared(policy, role, findings(*refused, predicted_violations=share))
         if self.controller is not None:
             return Cleared(self.controller, FIRST, findings(*refused))
-        if self._last is None:
-            raise ValueError(
-                f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, "
-                "such as --start controller."
-            )
-        role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
-        policy.load_state_dict(self._last["weights"])
-        assert episodes is not None  # without limits, only the controller's costs refuse a policy
-        share = self.predicted(policy, episodes)
-        return Cleared(policy, role, findings(*refused, predicted_violations=share))
+        raise ValueError(
+            f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, such "
+            "as --start controller."
+        )
 
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
         """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
@@ -352,7 +351,7 @@ class Operating:
         return self.step.flights.fly_first(teacher)
 
     def hand_over(self, role: Role, episode: int) -> None:
-        """Hand over the policy that acts now, or another one if the twin predicts that it would leave the limits.
+        """Hand over what acts now, which :class:`Clearance` chooses.
 
         Args:
             role: role that is live.

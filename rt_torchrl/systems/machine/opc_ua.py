@@ -129,11 +129,16 @@ class OpcUaLink:
             if kind.name not in ("Double", "Float"):
                 number = round(value)
                 if number != value:
-                    raise ValueError("it takes whole numbers; give the machine a node of type Double")
+                    raise ValueError("it takes whole numbers")
             struct.pack(f"<{FORMATS[kind.name]}", number)
         except (ValueError, OverflowError, struct.error) as error:
-            node = f"node {self._written[tag]!r} of type {kind.name}"
-            raise RefusedRequestError(f"{self.url}: {tag!r} = {value:g} does not fit {node}: {error}.") from error
+            node, bits = f"node {self._written[tag]!r} of type {kind.name}", 8 * struct.calcsize(FORMATS[kind.name])
+            low, high = (0, 2**bits - 1) if FORMATS[kind.name].isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+            takes = "single precision" if kind.name == "Float" else f"whole numbers from {low} to {high}"
+            raise RefusedRequestError(
+                f"{self.url}: {tag!r} = {value:g} does not fit {node}, which takes {takes}; give the machine a node of "
+                "type Double."
+            ) from error
         return self._ua.Variant(number, kind)
 
     def read(self) -> dict[str, float]:
