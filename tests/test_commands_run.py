@@ -174,4 +174,4 @@ def test_a_policy_is_exported(formats, kinds, clone):
 @pytest.mark.parametrize("command", [command for command in commands() if "recipes/study.py" in command])
 def test_a_printed_study_begins(command, clone, monkeypatch):
     """Up to its plan of tasks; the tests of the study run some."""
-    require_begun_here(command, clone, monkeypatch, "compare_runs" if "--runs" in command else "run_all")
+    require_begun_here(command, clone, monkeypatch, "rt_torchrl.compare_runs" if "--runs" in command else "run_all")
