@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role, TwinningConfig, other_than
+from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.report import Step, findings, in_words, merged, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
@@ -280,11 +280,10 @@ class Clearance:
         """
         episodes = self.virtual.draw(count) if self.limited and self.virtual.processes else None
         refused = list[str]()
-        for role in (role for role in (live, other_than(live)) if role in self.policies):
-            policy, share = self.policies[role], 0.0
-            if episodes is not None:
-                share = self.predicted(policy, episodes)
-            known = self.belief.beside_first(policy, self.controller)
+        for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
+            policy = self.policies[role]
+            share = 0.0 if episodes is None else self.predicted(policy, episodes)
+            known = self.belief.beside_first(policy, self.controller) if share == 0.0 else None
             if share > 0.0:
                 refused.append(f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals")
             elif known is not None and known[0] > TWICE * known[1]:
