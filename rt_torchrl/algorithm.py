@@ -44,10 +44,10 @@ from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
-from rt_torchrl.steps.interact import Clearance, Interact, RealFlights
+from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
-from rt_torchrl.steps.report import EpisodeReport, findings, merged, on_device
+from rt_torchrl.steps.report import EpisodeReport, merged, metrics, on_device
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
@@ -140,8 +140,8 @@ class ReinforcementTwinning(TensorDictSequential):
         rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
         flights = RealFlights(env, actor, rollout, twin.plant)
         trained = {role: policy for role, policy in policies.items() if config.arm in ("twinning", role)}
-        clearance = Clearance(system, trained, belief, config.limits, None if first is None else first.teacher)
-        interact = Interact(env, policies, flights, clearance, belief, config, judged)
+        supervisor = Supervisor(system, trained, belief, config.limits, None if first is None else first.teacher)
+        interact = Interact(env, policies, flights, supervisor, belief, config, judged)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
             assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
@@ -244,12 +244,14 @@ class ReinforcementTwinning(TensorDictSequential):
             if "model_based" in pupils:
                 self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
-        found = self.steps["switch"].imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
+        imitation_report = self.steps["switch"].imitation.begin(
+            self.first.teacher, imitating, batch_of(records), on_twin=on_twin
+        )
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
             self.virtual.processes.clear()
         start_cost = torch.stack([flight.cost for flight in flights]).mean()
-        return merged(merged(episode, found), findings(start_cost=start_cost))
+        return merged(merged(episode, imitation_report), metrics(start_cost=start_cost))
 
     def _sound(self, step: Callable[[TensorDictBase], TensorDictBase], episode: TensorDictBase) -> TensorDictBase:
         """Take a step that relies on the twin; the one rollback of the algorithm.
@@ -267,12 +269,12 @@ class ReinforcementTwinning(TensorDictSequential):
         try:
             while True:
                 try:
-                    taken = step(episode)
-                    return merged(taken, findings(*reasons, closure_refused=1.0)) if reasons else taken
+                    result = step(episode)
+                    return merged(result, metrics(*reasons, closure_refused=1.0)) if reasons else result
                 except DivergenceError as error:
                     if not closures:
                         self.model_based.load_state_dict(policy)
-                        left_out = findings(*reasons, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
+                        left_out = metrics(*reasons, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
                         warning = f"the twin diverges under a policy that has flown: {error}"
                         return merged(episode, left_out.set_non_tensor("warning", warning))
                     reasons = reasons or [f"closure refused: {error}"]

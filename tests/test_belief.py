@@ -16,7 +16,7 @@ from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.learn import Learn
-from rt_torchrl.steps.report import findings
+from rt_torchrl.steps.report import metrics
 from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
@@ -233,7 +233,7 @@ class Hasty(Content):
 
     def update(self):
         self.policy.load_state_dict(gains(2.0))
-        return findings()
+        return metrics()
 
 
 @pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])

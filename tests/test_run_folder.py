@@ -314,7 +314,7 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
-    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 6")
+    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 7")
 
 
 def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):

@@ -110,7 +110,7 @@ def plain(value: Any, place: str = "") -> Any:
     )
 
 
-FORMAT = 6
+FORMAT = 7
 KEPT = 3
 """Number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before."""
 FULL = (errno.ENOSPC, errno.EDQUOT)

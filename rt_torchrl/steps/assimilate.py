@@ -28,7 +28,7 @@ from rt_torchrl.plants.signal import differences
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
-from rt_torchrl.steps.report import Step, findings, merged
+from rt_torchrl.steps.report import Step, merged, metrics
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -114,18 +114,18 @@ class Assimilation:
 
     def _over_chosen_segments(self, whole: Trajectory) -> Descended:
         """Descend over whole records, or over segments if the twin is unstable and leaves these."""
-        sensors, begun = self._problem.sensors, copy.deepcopy(self._progress())
+        sensors, progress_before = self._problem.sensors, copy.deepcopy(self._progress())
         records, before = sensor_records(self.twin.plant, sensors, whole), dict[int, float]()
 
         def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
-            self._resume(copy.deepcopy(begun))
+            self._resume(copy.deepcopy(progress_before))
             self.length = min(length, whole.actions.shape[1])
-            found = self._descend_anew(self.in_segments(whole))
+            descended = self._descend_anew(self.in_segments(whole))
             # The first fit of a length begins with the present closure.
-            found = found._replace(start=before.setdefault(length, found.start))
-            return (found, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
+            descended = descended._replace(start=before.setdefault(length, descended.start))
+            return (descended, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
 
-        found, self.length, progress = over_segments(
+        descended, self.length, progress = over_segments(
             self.twin.closure,
             whole.actions.shape[1],
             fit,
@@ -133,7 +133,7 @@ class Assimilation:
             lambda: self._problem.unstable(records),
         )
         self._resume(progress)
-        return found
+        return descended
 
     def _progress(self) -> dict[str, Any]:
         """What the next descent depends on, except the closure."""
@@ -164,25 +164,25 @@ class Assimilation:
         prior = self.prior.cost if self.prior.stiffness else lambda: replayed.states.new_zeros(())
         before = prior().item()
         if config.method == "levenberg_marquardt":
-            found = self._least_squares(replayed)
+            descended = self._least_squares(replayed)
         else:
-            found = self.descent.run(
+            descended = self.descent.run(
                 lambda: self._identification_cost(replayed) + prior(),
                 config.iterations,
                 stop_below=config.stop_below,
             )
-        if math.isinf(found.start):
+        if math.isinf(descended.start):
             raise FloatingPointError("J_p of finite states overflows")
-        return found._replace(start=found.start - before, best=found.best - prior().item())
+        return descended._replace(start=descended.start - before, best=descended.best - prior().item())
 
     def _least_squares(self, replayed: Trajectory) -> Descended:
         """Descend by Levenberg-Marquardt; the damping goes on from episode to episode."""
         likelihood = self.likelihood(replayed, prior=self.prior)
         tolerance = 1e-4 if self.config.initial == "measured" else NOISE_TOLERANCE
         method = LevenbergMarquardt(likelihood.unknowns, damping=self.damping, tolerance=tolerance)
-        found = method.run(likelihood.normal_equations, self.config.iterations, stop_below=self.config.stop_below)
+        descended = method.run(likelihood.normal_equations, self.config.iterations, stop_below=self.config.stop_below)
         self.damping = method.damping
-        return found
+        return descended
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         return identification_cost(self.twin.plant, self._flown(replayed), replayed.states, replayed.seen).mean()
@@ -325,15 +325,17 @@ class Assimilate(Step):
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         report = self.fit(list(self.short_term))
-        found = self.belief.examine()
+        examination = self.belief.examine()
         if self.assimilation.explain(self.belief.unexplained, self.generator):
-            found = merged(findings(**self.assimilation.report()), self.belief.examine())
-        return merged(merged(episode, report), found)
+            examination = merged(metrics(**self.assimilation.report()), self.belief.examine())
+        return merged(merged(episode, report), examination)
 
     def fit(self, records: Sequence[Trajectory]) -> TensorDictBase:
         """Fit the twin to records; the report of the fit."""
         latest, processes = self.belief.virtual.paired(records)
         self.closure_before = copy.deepcopy(self.belief.virtual.twin.closure.state_dict())
-        found = self.assimilation.update(latest, processes, self.realisations, self.generator)
-        fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
-        return merged(fit, findings(**self.assimilation.report()))
+        descended = self.assimilation.update(latest, processes, self.realisations, self.generator)
+        fit = metrics(
+            J_p_before=descended.start, J_p=descended.best, closure_gradient=descended.gradient, closure_refused=0.0
+        )
+        return merged(fit, metrics(**self.assimilation.report()))

@@ -37,7 +37,7 @@ from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.report import findings, same_architecture
+from rt_torchrl.steps.report import metrics, same_architecture
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -178,15 +178,15 @@ class Belief:
             None where no controller flew first or it cost nothing, the twin alone has the word, or the policy is state
             feedback, which plans on the twin while it acts.
         """
-        paid = sum(one.cost for one in self.first) / max(1, len(self.first))
+        paid = sum(flight.cost for flight in self.first) / max(1, len(self.first))
         if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
-        episodes = [self.virtual.repeated(one.trajectory) for one in self.first]
-        cost = sum(self.virtual.cost(policy, one) for one in episodes) / len(episodes)
+        episodes = [self.virtual.repeated(flight.trajectory) for flight in self.first]
+        cost = sum(self.virtual.cost(policy, episode) for episode in episodes) / len(episodes)
         if self.flown:
             return self.expected(policy, cost), paid
-        its = sum(self.virtual.cost(controller, one) for one in episodes) / len(episodes)
-        return (paid * cost / its if 0.0 < its < math.inf else math.inf), paid
+        controller_cost = sum(self.virtual.cost(controller, episode) for episode in episodes) / len(episodes)
+        return (paid * cost / controller_cost if 0.0 < controller_cost < math.inf else math.inf), paid
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it, until the next call for this role.
@@ -206,7 +206,7 @@ class Belief:
         Episodes of state feedback count as none, with NaN: its flights on the twin take too long.
         """
         pairs = zip(self.flown, self._predicted(), strict=True)
-        return [math.nan if math.isnan(predicted) else difference(one.cost, predicted) for one, predicted in pairs]
+        return [math.nan if math.isnan(predicted) else difference(flown.cost, predicted) for flown, predicted in pairs]
 
     def _predicted(self) -> list[float]:
         """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
@@ -228,22 +228,30 @@ class Belief:
             ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1. Nothing if
             state feedback or the controller that flew first flew it.
         """
-        found = self.differences()
-        if not found or math.isnan(found[-1]) or not self._policy_flew:
-            return findings()
-        quiet = [d for d, one in zip(found, self.flown, strict=True) if one.exploration <= QUIET and not math.isnan(d)]
-        said, hypothesis = alarm(quiet), self.virtual.twin.hypothesis
-        report = findings(paired_difference=found[-1], alarm=float(said is not None))
-        if said is None:
+        differences = self.differences()
+        if not differences or math.isnan(differences[-1]) or not self._policy_flew:
+            return metrics()
+        quiet = [
+            d
+            for d, flown in zip(differences, self.flown, strict=True)
+            if flown.exploration <= QUIET and not math.isnan(d)
+        ]
+        warning, hypothesis = alarm(quiet), self.virtual.twin.hypothesis
+        report = metrics(paired_difference=differences[-1], alarm=float(warning is not None))
+        if warning is None:
             return report
         explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
-        return report.set_non_tensor("warning", said + explained)
+        return report.set_non_tensor("warning", warning + explained)
 
     @property
     def unexplained(self) -> float:
         """Size of the last paired difference beyond what exploration explains."""
-        found = self.differences()
-        return 0.0 if not found or math.isnan(found[-1]) else beyond(found[-1], self.flown[-1].exploration)
+        differences = self.differences()
+        return (
+            0.0
+            if not differences or math.isnan(differences[-1])
+            else beyond(differences[-1], self.flown[-1].exploration)
+        )
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory]) -> float:
@@ -256,7 +264,7 @@ class Belief:
             flown = twin.replay(whole.states[:, 0], whole.exogenous, whole.actions, start=whole.start)
         except DivergenceError:
             return DEARER
-        real, predicted = (control_cost(twin.plant, one).tolist() for one in (whole, flown))
+        real, predicted = (control_cost(twin.plant, flights).tolist() for flights in (whole, flown))
         return max(abs(difference(*pair)) for pair in zip(real, predicted, strict=True))
 
     def judge(self, policy: nn.Module, episodes: Scenario) -> Judged:
@@ -271,7 +279,7 @@ class Belief:
             return cost
         weights = {name: weight.clone() for name, weight in policy.state_dict().items()}
         pairs = zip(self.differences(), self.flown, strict=True)
-        flown = [d for d, one in pairs if one.exploration <= QUIET and equal(one.weights, weights)]
+        flown = [d for d, flight in pairs if flight.exploration <= QUIET and equal(flight.weights, weights)]
         try:
             if self.contradicted and flown and not any(map(math.isnan, flown)):
                 anchors = self.anchors()
@@ -297,9 +305,9 @@ class Belief:
         if anchors is None or isinstance(policy, StateFeedback):
             return torch.zeros((), dtype=torch.float64, device=self.virtual.generator.device)
         replays = anchors.replays.latest(latest)
-        apart = (replays.actions(policy) - replays.flown).square().sum(-1) + replays.explored
+        distances = (replays.actions(policy) - replays.flown).square().sum(-1) + replays.explored
         alike = torch.exp(-0.5 * replays.distances() / LENGTH**2).sum(-1)
-        precisions = 1.0 / (anchors.noise + anchors.growth * alike * apart)
+        precisions = 1.0 / (anchors.noise + anchors.growth * alike * distances)
         return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
 
     @property
@@ -322,21 +330,21 @@ class Belief:
             return None
         whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
         for flown, predicted, d in zip(self.flown, self._predicted(), self.differences(), strict=True):
-            met = self.virtual.repeated(flown.trajectory).exogenous
+            exogenous = self.virtual.repeated(flown.trajectory).exogenous
             # State feedback is no function of an observation, a part of an episode has another cost, and where the
             # twin diverges, or nearly does, nothing is near.
-            if met.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER:
+            if exogenous.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER:
                 whole.append(flown)
-                inputs.append(met)
+                inputs.append(exogenous)
                 differences.append(d)
         if not whole:
             return None
-        made = self._twins.get(twin)
-        if made is None or made.closure is not twin.closure:
-            made = self._twins[twin] = twin.of(Anchored(twin.plant))
+        anchored = self._twins.get(twin)
+        if anchored is None or anchored.closure is not twin.closure:
+            anchored = self._twins[twin] = twin.of(Anchored(twin.plant))
         replays = AnchoredReplays(
             self.virtual.twin,
-            made,
+            anchored,
             [flown.trajectory for flown in whole],
             torch.cat(inputs),
             torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),
@@ -361,16 +369,16 @@ class Belief:
             except DivergenceError:  # of the others, not of the episode itself
                 corrections[k] = DEARER
                 corrections[k, k] = differences[k]
-        met = corrections.diag()
-        errors = (met.unsqueeze(-1) - corrections)[others].clamp(-DEARER, DEARER).square().cpu().numpy()
+        own_corrections = corrections.diag()
+        errors = (own_corrections.unsqueeze(-1) - corrections)[others].clamp(-DEARER, DEARER).square().cpu().numpy()
         explored = replays.explored + replays.explored.unsqueeze(-1)
-        apart = (replays.distances() + explored)[others].cpu().numpy()
-        noise, growth = NOISE**2, GROWTH * max(NOISE**2, met.square().mean().item())
+        distances = (replays.distances() + explored)[others].cpu().numpy()
+        noise, growth = NOISE**2, GROWTH * max(NOISE**2, own_corrections.square().mean().item())
         share = 1.0 / max(1, len(flown) - 1)
 
         def unlikely(logs: np.ndarray) -> float:
             sigma, v = np.exp(logs)
-            spread = 2.0 * sigma + v * apart
+            spread = 2.0 * sigma + v * distances
             misfit = share * (np.log(spread) + errors / spread).sum()
             return float(misfit + PRIOR * (logs.sum() + noise / sigma + growth / v))
 
@@ -408,7 +416,7 @@ class Belief:
             return
         twin, last = self.virtual.twin, self.flown[-1]
         again, elsewhere = self._predicted()[-1], self.virtual.cost(self.policy_of(last), episodes)
-        pairs = [(last.cost, again), (max(one.cost for one in self.flown), elsewhere)]
+        pairs = [(last.cost, again), (max(flown.cost for flown in self.flown), elsewhere)]
         if any(math.isinf(predicted) or difference(real, predicted) <= -DEARER for real, predicted in pairs):
             raise DivergenceError(
                 f"plant {twin.plant.name!r} diverged on its twin, or cost there e⁵ times what real episodes did, with "
@@ -418,13 +426,13 @@ class Belief:
     def state_dict(self) -> dict[str, Any]:
         flown: dict[str, Sequence[Flown | FirstFlown]] = {"flown": self.flown, "first": self.first}
         return {
-            name: [one._asdict() | {"trajectory": one.trajectory._asdict()} for one in episodes]
-            for name, episodes in flown.items()
+            name: [flight._asdict() | {"trajectory": flight.trajectory._asdict()} for flight in flights]
+            for name, flights in flown.items()
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.flown = [Flown(**one | {"trajectory": Trajectory(**one["trajectory"])}) for one in state["flown"]]
-        self.first = [FirstFlown(Trajectory(**one["trajectory"]), one["cost"]) for one in state["first"]]
+        self.flown = [Flown(**saved | {"trajectory": Trajectory(**saved["trajectory"])}) for saved in state["flown"]]
+        self.first = [FirstFlown(Trajectory(**saved["trajectory"]), saved["cost"]) for saved in state["first"]]
         self._costs = self._anchored = None
 
 
@@ -465,7 +473,7 @@ def alarm(differences: Sequence[float]) -> str | None:
 
 def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether two states, of a twin or of a policy, are the same."""
-    (one, structure), (two, its_structure) = tree_flatten(state), tree_flatten(other)
-    return structure == its_structure and all(
-        torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(one, two, strict=True)
+    (leaves, structure), (other_leaves, other_structure) = tree_flatten(state), tree_flatten(other)
+    return structure == other_structure and all(
+        torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(leaves, other_leaves, strict=True)
     )

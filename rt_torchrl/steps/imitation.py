@@ -24,7 +24,7 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief, equal
 from rt_torchrl.steps.config import Role
-from rt_torchrl.steps.report import findings, merged, same_architecture
+from rt_torchrl.steps.report import merged, metrics, same_architecture
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
@@ -77,20 +77,20 @@ class Imitation:
         """
         if isinstance(idle, StateFeedback):
             reason = f"no clone: {type(idle).__name__} plans its actions and cannot imitate a policy"
-            return findings(reason).set_non_tensor("event", "keep")
+            return metrics(reason).set_non_tensor("event", "keep")
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())
-            return findings()
+            return metrics()
         before, replaced = copy.deepcopy(idle.state_dict()), self.belief.judge(idle, judged_on)
         source = record if isinstance(live, StateFeedback) else seen()
         error = self.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
         clone, cost = self.belief.judge(idle, judged_on), self.virtual.cost(live, judged_on)
-        found = {"distillation_error": error, "distillation_cost_ratio": clone.on_twin / cost}
+        entries = {"distillation_error": error, "distillation_cost_ratio": clone.on_twin / cost}
         if clone <= replaced:
-            return findings(**found)
+            return metrics(**entries)
         idle.load_state_dict(before)
         reason = f"clone refused: its J_a is {clone.on_twin:.4g}, that of the policy it replaces {replaced.on_twin:.4g}"
-        return findings(reason, **found).set_non_tensor("event", "keep")
+        return metrics(reason, **entries).set_non_tensor("event", "keep")
 
     def begin(
         self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, *, on_twin: bool
@@ -112,13 +112,13 @@ class Imitation:
         # Every virtual episode of model predictive control takes as long as its solves.
         count = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else self.count
         judged_on = self.virtual.draw(count) if on_twin else None
-        report = findings()
+        report = metrics()
         for role, policy in pupils.items():
             first = next(other for other, start in starts.items() if clones(start, starts[role]))
             if first != role:
                 policy.load_state_dict(pupils[first].state_dict())
             elif judged_on is None:
-                report.update(findings(**{f"start_error_{role}": self._match(policy, [self._of_record(records)])}))
+                report.update(metrics(**{f"start_error_{role}": self._match(policy, [self._of_record(records)])}))
             else:
                 report = merged(report, self._begun(teacher, role, policy, records, judged_on))
         return report
@@ -129,21 +129,21 @@ class Imitation:
         before, start = copy.deepcopy(policy.state_dict()), self.virtual.judge(policy, judged_on)
         if teacher is None:
             error = self._match(policy, [self._of_record(records)])
-            wanted = control_cost(self.virtual.twin.plant, records).mean().item()
+            teacher_cost = control_cost(self.virtual.twin.plant, records).mean().item()
         else:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
             error = self.imitate(teacher, policy, seen=records, draw=draw)
-            model, wanted = self.virtual.judge(teacher, judged_on)
+            model, teacher_cost = self.virtual.judge(teacher, judged_on)
             if len(self.virtual.extremes) and self.virtual.judge(policy, judged_on)[0] > TWICE * abs(model):
                 policy.load_state_dict(before)
                 error = self.imitate(teacher, policy, seen=records, draw=lambda: self.virtual.with_extremes(draw()))
         cost = self.virtual.judge(policy, judged_on)
-        found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": min(cost, start)[1] / wanted}
+        entries = {f"start_error_{role}": error, f"start_cost_ratio_{role}": min(cost, start)[1] / teacher_cost}
         if cost <= start:
-            return findings(**found)
+            return metrics(**entries)
         policy.load_state_dict(before)
-        return findings(
-            f"{role} does not imitate the controller: its J_a would be {cost[1]:.4g}, not {start[1]:.4g}", **found
+        return metrics(
+            f"{role} does not imitate the controller: its J_a would be {cost[1]:.4g}, not {start[1]:.4g}", **entries
         )
 
     def imitate(
@@ -232,8 +232,8 @@ def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module]
         flown: function of a policy's weights alone, such as its costs over given episodes.
     """
     first, second = policies
-    found = {first: flown(policies[first])}
-    return found | {second: found[first] if clones(*policies.values()) else flown(policies[second])}
+    results = {first: flown(policies[first])}
+    return results | {second: results[first] if clones(*policies.values()) else flown(policies[second])}
 
 
 def clones(first: nn.Module, second: nn.Module) -> bool:

@@ -145,12 +145,12 @@ def _windowed_covariance(residuals: Float[np.ndarray, "n n_z"]) -> Float[np.ndar
     spectra = [np.fft.rfft(residual - residual.mean(), 2 * n) for residual in residuals.T]
     u = np.arange(n) / max(1, n // 4)
     window = np.where(u <= 0.5, 1.0 - 6.0 * u**2 * (1.0 - u), 2.0 * np.clip(1.0 - u, 0.0, None) ** 3)
-    found = np.empty((n, len(spectra), len(spectra)))
+    covariance = np.empty((n, len(spectra), len(spectra)))
     for k, first in enumerate(spectra):
         for j, second in enumerate(spectra):
             power = np.abs(first) ** 2 if k == j else first * second.conj()
-            found[:, k, j] = np.fft.irfft(power, 2 * n)[:n] / n * window
-    return found
+            covariance[:, k, j] = np.fft.irfft(power, 2 * n)[:n] / n * window
+    return covariance
 
 
 def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "samples n_z n_z"]:

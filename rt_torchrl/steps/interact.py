@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
-from rt_torchrl.steps.report import Step, findings, in_words, merged, plain
+from rt_torchrl.steps.report import Step, in_words, merged, metrics, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, Order
@@ -83,24 +83,24 @@ class Flight(NamedTuple):
     @property
     def cost(self) -> Tensor:
         """J_a as measured, in the sound part and after an early end."""
-        rewards, (count, each) = self.transitions["next", "reward"], self.after
-        return -(rewards.sum() - count * each) / (len(rewards) + count)
+        rewards, (count, end_cost) = self.transitions["next", "reward"], self.after
+        return -(rewards.sum() - count * end_cost) / (len(rewards) + count)
 
 
 def report_of_flights(flights: Sequence[Flight]) -> TensorDict:
     """The cost of the last of some flights, the faults of all, and how often and why they were flown again."""
     last = flights[-1]
-    found = findings(real_cost=last.cost, reward=-last.cost)
+    report = metrics(real_cost=last.cost, reward=-last.cost)
     refused = [reason for flight in flights for reason in flight.refused]
     if refused:
-        found.update(findings(episodes_refused=float(len(refused)), refusal="; ".join(refused)))
+        report.update(metrics(episodes_refused=float(len(refused)), refusal="; ".join(refused)))
     kinds = Counter(fault.kind for flight in flights for fault in flight.faults)
-    found.update(findings(**{f"faults/{kind}": float(count) for kind, count in kinds.items()}))
+    report.update(metrics(**{f"faults/{kind}": float(count) for kind, count in kinds.items()}))
     if last.ended:
-        found.update(findings(ended_after=float(len(last.transitions))))
+        report.update(metrics(ended_after=float(len(last.transitions))))
     if not all(flight.whole for flight in flights):
-        found.update(findings(sound_intervals=float(sum(len(part) for flight in flights for part in flight.parts))))
-    return found
+        report.update(metrics(sound_intervals=float(sum(len(part) for flight in flights for part in flight.parts))))
+    return report
 
 
 def flown(flights: Sequence[Flight]) -> TensorDict:
@@ -165,22 +165,22 @@ class RealFlights:
         faults: list[Fault] = []
         while True:
             self.actor.begin(policy, strength=strength)
-            episode, found, cause = self._attempt()
-            faults += found.faults
-            self.faults += found.faults
-            first, last = found.longest
-            if episode is not None and (found.whole or (not whole and last - first >= self._least)):
+            episode, sound, cause = self._attempt()
+            faults += sound.faults
+            self.faults += sound.faults
+            first, last = sound.longest
+            if episode is not None and (sound.whole or (not whole and last - first >= self._least)):
                 break
-            refused.append(found.reason)
+            refused.append(sound.reason)
             if len(refused) == FLIGHTS:
                 raise ValueError(tried_in_vain(refused)) from cause
-        parts = [_transitions(episode, part) for part in found.parts]
-        transitions = parts[found.parts.index((first, last))]
+        parts = [_transitions(episode, part) for part in sound.parts]
+        transitions = parts[sound.parts.index((first, last))]
         states = torch.cat([transitions["state"], transitions["next", "state"][-1:]])
         start = first * self.plant.dt
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
-        after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if found.whole else (0, 0.0)
-        self.latest = Flight(transitions, record, parts, refused, faults, found.whole, after)
+        after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
+        self.latest = Flight(transitions, record, parts, refused, faults, sound.whole, after)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
@@ -193,35 +193,35 @@ class RealFlights:
     def _attempt(self) -> tuple[TensorDictBase | None, SoundPart, Exception | None]:
         """One episode, its sound part, and the error that ended it."""
         try:
-            episode, ended = self.rollout()[0], None
+            episode, failure = self.rollout()[0], None
         except EpisodeEndedError as error:
-            ended, flown = error, error.flown
+            failure, flown = error, error.flown
             if flown is None:
                 fault = Fault("ended", 0, 0.0, str(error))
                 return None, SoundPart([], [fault], str(error), whole=False), error
             episode = flown[0]
         report = self.env.report if isinstance(self.env, Operation) else report_of(self.env)
-        found = sound_part(episode, self.plant, report)
-        if ended is None:
-            return episode, found, None
+        sound = sound_part(episode, self.plant, report)
+        if failure is None:
+            return episode, sound, None
         n = len(episode)
-        fault = Fault("ended", n, n * self.plant.dt, str(ended))
-        reason = "; ".join(part for part in (found.reason, str(ended)) if part)
-        return episode, found._replace(faults=[*found.faults, fault], reason=reason, whole=False), ended
+        fault = Fault("ended", n, n * self.plant.dt, str(failure))
+        reason = "; ".join(part for part in (sound.reason, str(failure)) if part)
+        return episode, sound._replace(faults=[*sound.faults, fault], reason=reason, whole=False), failure
 
 
 def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
     """The transitions of a part of an episode; the last one is truncated, unless the episode ends there early."""
     first, last = part
-    found = episode[first:last].clone() if last - first < len(episode) else episode
+    transitions = episode[first:last].clone() if last - first < len(episode) else episode
     # The learner learns from the action that was applied.
-    found["action"] = found["next", "applied"]
-    found["next", "done"][-1] = True
-    found["next", "truncated"][-1] = ~found["next", "terminated"][-1]
-    return found
+    transitions["action"] = transitions["next", "applied"]
+    transitions["next", "done"][-1] = True
+    transitions["next", "truncated"][-1] = ~transitions["next", "terminated"][-1]
+    return transitions
 
 
-class Cleared(NamedTuple):
+class Choice(NamedTuple):
     """What may act, the role whose weights it has or ``first``, and the report of the check."""
 
     policy: nn.Module
@@ -229,7 +229,7 @@ class Cleared(NamedTuple):
     report: TensorDict
 
 
-class Clearance:
+class Supervisor:
     """Lets a policy act only if it is expected to keep the limits, and not to cost twice what flew first.
 
     The live policy is asked first, then the idle one. Where neither may act, the weights do that were cleared for the
@@ -264,7 +264,7 @@ class Clearance:
         """The role and weights that were cleared last."""
 
     @torch.no_grad()
-    def choose(self, live: Role, count: int) -> Cleared:
+    def choose(self, live: Role, count: int) -> Choice:
         """What may act.
 
         Args:
@@ -293,17 +293,17 @@ class Clearance:
                     f"{paid}"
                 )
             elif episodes is None:
-                return Cleared(policy, role, findings(*refused))
+                return Choice(policy, role, metrics(*refused))
             else:
                 self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
-                return Cleared(policy, role, findings(*refused, predicted_violations=share))
+                return Choice(policy, role, metrics(*refused, predicted_violations=share))
         if self._last is not None and episodes is not None:
             role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
             policy.load_state_dict(self._last["weights"])
             share = self.predicted(policy, episodes)
-            return Cleared(policy, role, findings(*refused, predicted_violations=share))
+            return Choice(policy, role, metrics(*refused, predicted_violations=share))
         if self.controller is not None:
-            return Cleared(self.controller, FIRST, findings(*refused))
+            return Choice(self.controller, FIRST, metrics(*refused))
         raise ValueError(
             f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, such "
             "as --start controller."
@@ -321,7 +321,7 @@ class Clearance:
     def counted(self, flown: Trajectory) -> TensorDict:
         """Numbers of control intervals of a real episode beyond each kind of limits."""
         broken = self.limits.broken(flown)
-        return findings(**{f"violations/{kind}": found.sum().double() for kind, found in broken.items()})
+        return metrics(**{f"violations/{kind}": intervals.sum().double() for kind, intervals in broken.items()})
 
     def state_dict(self) -> dict[str, Any]:
         return {"last": self._last}
@@ -350,15 +350,15 @@ class Operating:
         return self.step.flights.fly_first(teacher)
 
     def hand_over(self, role: Role, episode: int) -> None:
-        """Hand over what acts now, which :class:`Clearance` chooses.
+        """Hand over what acts now, which :class:`Supervisor` chooses.
 
         Args:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        policy, name, report = self.step.clearance.choose(role, self.step.judged)
+        policy, name, report = self.step.supervisor.choose(role, self.step.judged)
         strength = 0.0 if name == FIRST else self._exploration.strength(episode)
-        self.operation.hand_over(name, policy, strength=strength, found=plain(report))
+        self.operation.hand_over(name, policy, strength=strength, report=plain(report))
 
     def take(self, live: Role, episode: int) -> tuple[Sequence[Flight], TensorDict]:
         """Take every window that has come in; wait until one is of a policy.
@@ -386,23 +386,23 @@ class Operating:
 
     def _order_of(self, flight: Flight) -> Order:
         versions = flight.transitions["version"].flatten()
-        found, counts = versions.unique(return_counts=True)
-        return self.operation.orders[int(found[counts == counts.max()].max())]
+        numbers, counts = versions.unique(return_counts=True)
+        return self.operation.orders[int(numbers[counts == counts.max()].max())]
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])
         cost = torch.stack([flight.cost for flight in flights]).mean()
-        report = report_of_flights(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
-        report.update(findings(windows=float(len(flights)), version=float(order.version)))
-        merged(report, findings(**(order.found or {}))).update(findings(**(self.operation.acted or {})))
-        if self.step.clearance.limited:
-            counted = [self.step.clearance.counted(flight.record) for flight in flights]
+        report = report_of_flights(flights).update(metrics(real_cost=cost, reward=-cost, exploration=order.strength))
+        report.update(metrics(windows=float(len(flights)), version=float(order.version)))
+        merged(report, metrics(**(order.report or {}))).update(metrics(**(self.operation.acted or {})))
+        if self.step.supervisor.limited:
+            counted = [self.step.supervisor.counted(flight.record) for flight in flights]
             kinds = counted[0].keys()
-            report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
+            report.update(metrics(**{kind: sum(float(violations[kind]) for violations in counted) for kind in kinds}))
         late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
         if late.any():
             period = 1e3 * late
-            report.update(findings(late_median=period.median(), late_p99=period.quantile(0.99), late_max=period.max()))
+            report.update(metrics(late_median=period.median(), late_p99=period.quantile(0.99), late_max=period.max()))
         return report.set_non_tensor("live", order.name)
 
 
@@ -418,7 +418,7 @@ class Interact(Step):
         env: the real system, or an operation of one.
         policies: both policies by role.
         flights: real episodes of the system.
-        clearance: which policy may act.
+        supervisor: which policy may act.
         belief: what takes the costs of whole episodes, and has the virtual episodes.
         config: hyper-parameters.
         judged: number of virtual episodes on which policies are judged.
@@ -432,15 +432,15 @@ class Interact(Step):
         env: EnvBase | Operation,
         policies: dict[Role, nn.Module],
         flights: RealFlights,
-        clearance: Clearance,
+        supervisor: Supervisor,
         belief: Belief,
         config: TwinningConfig,
         judged: int,
     ):
         short_term = ShortTermMemory(maxlen=config.records)
-        super().__init__(env=env, clearance=clearance, short_term=short_term)
+        super().__init__(env=env, supervisor=supervisor, short_term=short_term)
         self.short_term, self.policies, self.flights = short_term, policies, flights
-        self.clearance, self.belief, self.virtual = clearance, belief, belief.virtual
+        self.supervisor, self.belief, self.virtual = supervisor, belief, belief.virtual
         self.config, self.judged = config, judged
         self.operating = Operating(env, self) if isinstance(env, Operation) else None
 
@@ -457,16 +457,16 @@ class Interact(Step):
 
     def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
         """One episode of the policy that may act, the live one if it is cleared."""
-        cleared = self.clearance.choose(live, self.judged)
-        acting, strength = cleared.policy, 0.0 if cleared.role == FIRST else self.config.exploration.strength(number)
+        choice = self.supervisor.choose(live, self.judged)
+        acting, strength = choice.policy, 0.0 if choice.role == FIRST else self.config.exploration.strength(number)
         flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
-        self.keep(flight, cleared.role, self.flights.actor.strength, acting.state_dict())
-        report = merged(report_of_flights([flight]), findings(exploration=self.flights.actor.strength))
-        report = merged(report, cleared.report)
-        if self.clearance.limited:
-            report.update(self.clearance.counted(flight.record))
-        report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
-        return [flight], report.set_non_tensor("live", cleared.role)
+        self.keep(flight, choice.role, self.flights.actor.strength, acting.state_dict())
+        report = merged(report_of_flights([flight]), metrics(exploration=self.flights.actor.strength))
+        report = merged(report, choice.report)
+        if self.supervisor.limited:
+            report.update(self.supervisor.counted(flight.record))
+        report.update(metrics(**acting.report()) if isinstance(acting, StateFeedback) else {})
+        return [flight], report.set_non_tensor("live", choice.role)
 
     def keep(self, flight: Flight, pilot: str, strength: float, weights: Mapping[str, Tensor]) -> None:
         """Remember the record of a flight and, if it is one of a whole episode, what it cost."""

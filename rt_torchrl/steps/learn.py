@@ -37,7 +37,7 @@ from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
-from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
+from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 
 
 @runtime_checkable
@@ -123,9 +123,9 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
     def make(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
         n_a = cast(ProbabilisticActor, actor).spec["action"].shape[-1]
         options = {"num_qvalue_nets": len(critics), "loss_function": "l2", "target_entropy": -float(n_a)}
-        made = loss(actor, critics, alpha_init=0.1, **options)
-        float(made.target_entropy)  # REDQ registers it when it is first read, too late for a state that is loaded
-        return made
+        instance = loss(actor, critics, alpha_init=0.1, **options)
+        float(instance.target_entropy)  # REDQ registers it when it is first read, too late for a state that is loaded
+        return instance
 
     return make
 
@@ -382,12 +382,12 @@ class ActorCritic:
             torch.set_num_threads(threads)
         for name, part in parts.items():
             part.load_state_dict(before[name])
-        said = f"update of model_free taken back: {reason}; use smaller learning rates or reward_scale"
-        return TensorDict().set_non_tensor("reason", said)
+        message = f"update of model_free taken back: {reason}; use smaller learning rates or reward_scale"
+        return TensorDict().set_non_tensor("reason", message)
 
     def _iterate(self) -> TensorDict:
         config, delay = self.config, self.method.delay
-        found: dict[str, list[Tensor]] = {}
+        results_by_name: dict[str, list[Tensor]] = {}
         phases = [("critic", config.critic_iterations)] + ([] if delay else [("actor", config.actor_iterations)])
         for kind, count in phases:
             for first in range(0, count, AT_ONCE):
@@ -403,11 +403,11 @@ class ActorCritic:
                     results = self._iterations[name](batch)
                     errors += [results.pop("errors")] if "errors" in results else []
                     for entry, value in results.items():
-                        found.setdefault(entry, []).append(value)
+                        results_by_name.setdefault(entry, []).append(value)
                 if errors:
                     self.memory.refresh(drawn["index"], torch.cat(errors))
         scale = config.reward_scale
-        return TensorDict({name: torch.stack(v).mean() / scale ** POWERS[name] for name, v in found.items()})
+        return TensorDict({name: torch.stack(v).mean() / scale ** POWERS[name] for name, v in results_by_name.items()})
 
     def observations(self) -> Float[Tensor, "n n_o"]:
         """See :meth:`Learner.observations`."""
@@ -791,14 +791,14 @@ class Learn(Step):
         report = self.learner.update()
         if self.belief.corrects and virtual.processes:
             judged_on, after = virtual.draw(self.count), copy.deepcopy(policy.state_dict())
-            found = self.belief.judge(policy, judged_on)
+            judgement = self.belief.judge(policy, judged_on)
             policy.load_state_dict(before)
-            earlier = self.belief.judge(policy, judged_on)
-            if found > earlier:
+            judgement_before = self.belief.judge(policy, judged_on)
+            if judgement > judgement_before:
                 self.learner.restart()
-                costs = f"J_a of model_free would be {found.on_twin:.4g}, it was {earlier.on_twin:.4g}"
-                report = merged(report, findings(f"update refused: {costs}", update_accepted=0.0))
+                costs = f"J_a of model_free would be {judgement.on_twin:.4g}, it was {judgement_before.on_twin:.4g}"
+                report = merged(report, metrics(f"update refused: {costs}", update_accepted=0.0))
             else:
                 policy.load_state_dict(after)
-                report = merged(report, findings(update_accepted=1.0))
+                report = merged(report, metrics(update_accepted=1.0))
         return merged(episode, report).set(("weight_changes", "model_free"), weight_change(policy, weights))

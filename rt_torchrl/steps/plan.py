@@ -14,7 +14,7 @@ from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, norm_of
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
-from rt_torchrl.steps.report import Step, findings, merged, same_architecture, weight_change
+from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -82,11 +82,11 @@ class WholeEpisodes:
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
-        found = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
-        if self.stalled(found.start, found.best, found.gradient):
+        descended = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
+        if self.stalled(descended.start, descended.best, descended.gradient):
             again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
-            found = found._replace(best=again.best, iterations=found.iterations + again.iterations)
-        return found
+            descended = descended._replace(best=again.best, iterations=descended.iterations + again.iterations)
+        return descended
 
     def stalled(self, before: float, after: float, gradient: float) -> bool:
         r"""Whether a plan gained nothing, although its first gradient promised more than is believable.
@@ -259,19 +259,19 @@ class MultiStart:
             return self._descended(planned_on)
         present = copy.deepcopy(policy.state_dict())
         self.belief.require_sound_twin(judged_on)
-        stays = self.belief.judge(policy, judged_on)
-        best = self._from_the_present(present, stays, planned_on, judged_on)
+        before = self.belief.judge(policy, judged_on)
+        best = self._from_the_present(present, before, planned_on, judged_on)
         several = self._several(episode, best)
         whole = isinstance(self.planner, WholeEpisodes)
         corrected = whole and self.belief.corrects and self.belief.contradicted
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
-        recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < stays else []
+        recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < before else []
         if several or recalled:
             others = self._others(episode, planned_on, flown) if several else recalled
             new = ((number, weights) for number, weights in others if not equal(weights, present))
             best = self._best(best, new, planned_on, judged_on)
         if flown is not None and corrected and flown[1] < best.cost:
-            best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
+            best = Plan(*flown, metrics(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
             self.planner.restart()
         return best.report
@@ -297,24 +297,24 @@ class MultiStart:
             self.planner.restart()
         else:
             self.planner.load_state_dict(after)
-        return best._replace(report=best.report.update(findings(start=float(start))))
+        return best._replace(report=best.report.update(metrics(start=float(start))))
 
-    def _from_the_present(self, present: Weights, stays: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
+    def _from_the_present(self, present: Weights, before: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
         """A plan from the present weights, or these; one that fails from extreme starts is made again on these, too."""
         policy, episodes = self.planner.policy, planned_on
         while True:
             report = self._descended(episodes, usual=planned_on)
             if not report["plan_accepted"]:
-                return Plan(present, stays, report)
+                return Plan(present, before, report)
             cost = self.belief.judge(policy, judged_on)
-            if cost <= stays and math.isfinite(cost.on_twin):
+            if cost <= before and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
             policy.load_state_dict(present)
             self.planner.restart()
-            fails_at_extremes = len(self.virtual.extremes) and cost.on_twin <= stays.on_twin
+            fails_at_extremes = len(self.virtual.extremes) and cost.on_twin <= before.on_twin
             if not fails_at_extremes or episodes is not planned_on:
-                refused = findings(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
-                return Plan(present, stays, report.update(refused))
+                refused = metrics(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
+                return Plan(present, before, report.update(refused))
             episodes = self.virtual.with_extremes(planned_on)
 
     def _descended(self, episodes: Scenario, usual: Scenario | None = None) -> TensorDict:
@@ -330,7 +330,7 @@ class MultiStart:
             self.belief.require_sound_twin(episodes if usual is None else usual)
             policy.load_state_dict(before)
             self.planner.restart()
-            return findings("no plan: the twin diverges", plan_accepted=0.0)
+            return metrics("no plan: the twin diverges", plan_accepted=0.0)
 
     def _several(self, episode: int, plan: Plan) -> bool:
         """Whether to plan from other weights, too."""
@@ -380,9 +380,11 @@ class MultiStart:
         self._first, self._stalled = state["first"], state["stalled"]
 
 
-def planned(found: Descended) -> TensorDict:
+def planned(descent: Descended) -> TensorDict:
     """The report of a plan that is kept."""
-    return findings(J_a_plan_before=found.start, J_a_plan=found.best, policy_gradient=found.gradient, plan_accepted=1.0)
+    return metrics(
+        J_a_plan_before=descent.start, J_a_plan=descent.best, policy_gradient=descent.gradient, plan_accepted=1.0
+    )
 
 
 class MakePlan(Step):

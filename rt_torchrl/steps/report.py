@@ -47,7 +47,7 @@ class Step(TensorDictModuleBase):
                 raise ValueError(f"the saved state of {name} does not fit: {error}") from error
 
 
-def findings(*reasons: str, **values: float | Tensor | str) -> TensorDict:
+def metrics(*reasons: str, **values: float | Tensor | str) -> TensorDict:
     """A report with scalars in double precision, texts and, if there are reasons, the entry ``reason``.
 
     Args:

@@ -120,10 +120,10 @@ class EarlierPolicies:
         closure.load_state_dict(self.closure.state_dict())
         pupils: list[Role] = []
         for role, policy in policies.items():
-            own = self.policies.get(role, self.teacher)
-            known = next((earlier for earlier in (own, self.teacher) if takes(policy, earlier)), None)
-            if known is not None:
-                policy.load_state_dict(known.state_dict())
+            earlier_policy = self.policies.get(role, self.teacher)
+            source = next((earlier for earlier in (earlier_policy, self.teacher) if takes(policy, earlier)), None)
+            if source is not None:
+                policy.load_state_dict(source.state_dict())
             elif not isinstance(policy, StateFeedback):  # which plans on the closure and needs no weights
                 pupils.append(role)
         return pupils
@@ -178,12 +178,12 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     truncated = never.clone()
     truncated[-1] = True
     ended = {"reward": reward.unsqueeze(-1), "done": truncated, "truncated": truncated.clone(), "terminated": never}
-    begun = {key: never.clone() for key in ("done", "truncated", "terminated")}
+    flags = {key: never.clone() for key in ("done", "truncated", "terminated")}
     return TensorDict(
         {
             "observation": observation[:-1],
             "action": actions,
-            **begun,
+            **flags,
             "next": {"observation": observation[1:], **ended},
         },
         batch_size=[n],

@@ -13,7 +13,7 @@ from rt_torchrl.steps.config import ROLES, RefereeConfig, Role, other_than
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
 from rt_torchrl.steps.plan import Planner
-from rt_torchrl.steps.report import Step, findings, merged, record_of
+from rt_torchrl.steps.report import Step, merged, metrics, record_of
 
 Event = Literal["keep", "swap", "clone"]
 STALL = 0.5
@@ -187,8 +187,8 @@ class Switch(Step):
             idle_weight_change=float(episode.get(("weight_changes", idle), 0.0)),
         )
         event = self.referee.decide(evidence)
-        report = findings(*diverged, **{f"J_a_{role}": costs[role].on_twin for role in ROLES})
-        report = report.update(findings(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
+        report = metrics(*diverged, **{f"J_a_{role}": costs[role].on_twin for role in ROLES})
+        report = report.update(metrics(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
         if event == "clone":
             policies, record = (self.policies[live], self.policies[idle]), record_of(episode)
             cloned = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)

@@ -52,14 +52,14 @@ class Order(NamedTuple):
         name: name of the policy, such as its role.
         weights: its weights.
         strength: strength ξ of the exploration.
-        found: what was found about the policy before, such as ``predicted_violations``, by name.
+        report: what is known of the policy beforehand, such as ``predicted_violations``, by name.
     """
 
     version: int
     name: str
     weights: dict[str, Tensor]
     strength: float
-    found: dict[str, float | str] | None = None
+    report: dict[str, float | str] | None = None
 
     def ready(self, policies: Mapping[str, nn.Module]) -> nn.Module:
         """The policy as a module of its own, ready to act: state feedback has made its first plan.
@@ -329,7 +329,7 @@ class Operation:
         return closure
 
     def hand_over(
-        self, name: str, policy: nn.Module, *, strength: float, found: dict[str, float | str] | None = None
+        self, name: str, policy: nn.Module, *, strength: float, report: dict[str, float | str] | None = None
     ) -> None:
         """Hand a policy over, which takes over while the system operates.
 
@@ -337,10 +337,10 @@ class Operation:
             name: name of the policy: its role, or ``first``.
             policy: the policy, as it is now.
             strength: strength ξ of the exploration.
-            found: what was found about the policy before, by name.
+            report: what is known of the policy beforehand, by name.
         """
         weights = {key: value.detach().clone() for key, value in policy.state_dict().items()}
-        order = Order(self.version + 1, name, weights, strength, found)
+        order = Order(self.version + 1, name, weights, strength, report)
         self._pass_on(order)
         self.version, self.orders[order.version] = order.version, order
 

@@ -100,10 +100,12 @@ class Reread(Extension):
         closure: nn.Module,
     ) -> Transition:
         """One interval of the plant from the readings, or from its own states."""
-        met, read, flag = exogenous.split([self._met, self._read, 1], -1)
-        own, hidden = state[..., : self._read], state[..., self._read :]
-        known = torch.where(flag + torch.zeros_like(own) > 0.5, read + torch.zeros_like(own), own)
-        return self.base.step(t, torch.cat([known, hidden], -1), command, met, closure)
+        inputs, readings, flag = exogenous.split([self._met, self._read, 1], -1)
+        simulated, hidden = state[..., : self._read], state[..., self._read :]
+        measured = torch.where(
+            flag + torch.zeros_like(simulated) > 0.5, readings + torch.zeros_like(simulated), simulated
+        )
+        return self.base.step(t, torch.cat([measured, hidden], -1), command, inputs, closure)
 
 
 def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
@@ -188,10 +190,10 @@ class Fit:
         if not (first or arrived or least < FAR * self.least):
             present = copy.deepcopy(self.twin.closure.state_dict())
             self.twin.closure.load_state_dict(self._first)
-            found, _ = self._run(records, FIRST, generator)
-            if not found < least:
+            anew, _ = self._run(records, FIRST, generator)
+            if not anew < least:
                 self.twin.closure.load_state_dict(present)
-            least = min(found, least)
+            least = min(anew, least)
         self.least = least
         return least
 
@@ -207,7 +209,7 @@ class Fit:
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         if self._held and math.isfinite(least):  # see HELD
             self.short.prior.stiffness = self.whole.prior.stiffness = HELD * least
-        taken = {
+        stages_by_name = {
             "short": (self.short, [reread(record, plant, self.segment) for record in records]),
             "whole": (self.whole, self.rested(records)),
         }
@@ -217,12 +219,12 @@ class Fit:
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
-                stage, given = taken[name]
-                steps = stage.update(given, (), 1, generator).iterations
-            found = misfit(self.twin, records, self.segment)
-            if found < least:
-                least, best = found, copy.deepcopy(closure.state_dict())
-            elif not found < FAR * least:
+                stage, stage_records = stages_by_name[name]
+                steps = stage.update(stage_records, (), 1, generator).iterations
+            present = misfit(self.twin, records, self.segment)
+            if present < least:
+                least, best = present, copy.deepcopy(closure.state_dict())
+            elif not present < FAR * least:
                 closure.load_state_dict(best)
             arrived = name == "short" and steps < STEPS
             if arrived:
@@ -296,7 +298,7 @@ class EnsembleAssimilation(Assimilation):
         super().__init__(twin, config)
         self.ensemble, self.hypotheses = twin, hypotheses
         self.segment = max(2, twin.plant.n_steps // SHORT)
-        self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
+        self.fits = {name: Fit(suspect, config, self.segment) for name, suspect in twin.twins.items() if name != ALONE}
         self.always, self.turns = always, {name: Turns() for name in twin.twins}
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call or set(twin.weights) != {ALONE}
@@ -317,13 +319,13 @@ class EnsembleAssimilation(Assimilation):
         believed = self.fits.get(self.ensemble.likeliest)
         self._before = None if believed is None else believed.cost(records)
         if self.turns[ALONE].due() or self.always or ALONE in self.ensemble.weights:
-            found = super().update(records, processes, count, generator)
+            descended = super().update(records, processes, count, generator)
         else:
             self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
-            found = Descended(cost, cost, math.nan, 0)
+            descended = Descended(cost, cost, math.nan, 0)
         if self.called:
             self._weigh(generator)
-        return found
+        return descended
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
@@ -363,13 +365,13 @@ class EnsembleAssimilation(Assimilation):
         update; ``J_p_before`` is that of the one that was the likeliest before, as it was then.
         """
         weights, believed = self.ensemble.weights, self.fits.get(self.ensemble.likeliest)
-        found: dict[str, float | str] = {f"hypothesis/{name}": weights.get(name, 0.0) for name in self.ensemble.twins}
-        found |= {f"misfit/{name}": value for name, value in self.misfits.items()}
+        metrics: dict[str, float | str] = {f"hypothesis/{name}": weights.get(name, 0.0) for name in self.ensemble.twins}
+        metrics |= {f"misfit/{name}": value for name, value in self.misfits.items()}
         if self._before is not None:
-            found["J_p_before"] = self._before
+            metrics["J_p_before"] = self._before
         if believed is not None and self._records:
-            found |= {"J_p": believed.cost(self._records), "believed": self.ensemble.likeliest}
-        return {**found, **super().report()}
+            metrics |= {"J_p": believed.cost(self._records), "believed": self.ensemble.likeliest}
+        return {**metrics, **super().report()}
 
     def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
         """RMS errors of the likeliest hypothesis; see :meth:`Assimilation.rms_errors`."""

@@ -106,13 +106,13 @@ class TwinEnsemble(DigitalTwin):
         Raises:
             ValueError: if the hypotheses are others, or a closure does not fit.
         """
-        closures, own = state["closures"], [name for name in self.twins if name != ALONE]
-        if closures.keys() != set(own):
+        closures, names = state["closures"], [name for name in self.twins if name != ALONE]
+        if closures.keys() != set(names):
             raise ValueError(
-                f"hypotheses {quoted(closures)} of the state are not those of the twin, {quoted(own)}; plant "
+                f"hypotheses {quoted(closures)} of the state are not those of the twin, {quoted(names)}; plant "
                 f"{self.plant.name!r} must suspect what it suspected then."
             )
-        for name in own:
+        for name in names:
             try:
                 self.twins[name].closure.load_state_dict(closures[name])
             except RuntimeError as error:
@@ -140,8 +140,10 @@ class TwinEnsemble(DigitalTwin):
         both can be compared.
         """
         twins = [self.twins[name] for name in self._shares]
-        each = torch.stack([twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins])
-        return each.new_tensor(list(self._shares.values())) @ each
+        costs = torch.stack(
+            [twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins]
+        )
+        return costs.new_tensor(list(self._shares.values())) @ costs
 
 
 def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, engine: Engine = "native") -> DigitalTwin:
@@ -152,7 +154,7 @@ def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, eng
     Raises:
         ValueError: if the plant suspects nothing of a name that the configuration lists.
     """
-    taken = plant.suspects() if config.which == ("automatic",) else {}
+    suspects = plant.suspects() if config.which == ("automatic",) else {}
     if config.which not in (("automatic",), ("none",)):
         known = {**plant.suspects(), **plant.further_suspects()}
         unknown = [name for name in config.which if name not in known]
@@ -161,12 +163,12 @@ def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, eng
                 f"hypotheses.which: plant {plant.name!r} does not suspect {quoted(unknown)}; choose among "
                 f"{quoted(known) or '(nothing)'}, or give a TwinEnsemble of your own."
             )
-        taken = {name: suspect for name, suspect in known.items() if name in config.which}
-    if not taken:
+        suspects = {name: suspect for name, suspect in known.items() if name in config.which}
+    if not suspects:
         return DigitalTwin(plant, closure, engine=engine)
     device = next((w.device for w in closure.parameters()), torch.device("cpu"))
-    closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
-    return TwinEnsemble(plant, closure, taken, closures, engine=engine)
+    closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in suspects.items()}
+    return TwinEnsemble(plant, closure, suspects, closures, engine=engine)
 
 
 def extended(suspect: Plant, closure: nn.Module) -> nn.Module:

@@ -63,19 +63,19 @@ def test_a_policy_that_would_leave_them_does_not_act():
     found.policies[found.referee.live].load_state_dict(wild)
     live = found.referee.live
     idle = other_than(live)
-    cleared = found.steps["interact"].clearance.choose(live, 5)
-    assert cleared.role == idle and f"{live} may not act" in cleared.report["reason"]
-    assert cleared.report["predicted_violations"] == 0.0
+    choice = found.steps["interact"].supervisor.choose(live, 5)
+    assert choice.role == idle and f"{live} may not act" in choice.report["reason"]
+    assert choice.report["predicted_violations"] == 0.0
     # The oracle: the same share by a flight of the twin.
     episodes = found.virtual.draw(5)
-    share = found.steps["interact"].clearance.predicted(found.policies[live], episodes)
+    share = found.steps["interact"].supervisor.predicted(found.policies[live], episodes)
     flown = found.twin.control(found.policies[live], *episodes)
     beyond = (flown.states[:, 1:, 1].abs() > 3.0) | (flown.actions[..., 0].abs() > 1.0)
     jumps = torch.cat([torch.zeros(5, 1), flown.actions[..., 0].diff(dim=1)], 1).abs() > 0.5 * (1 + 1e-9)
     assert share == pytest.approx((beyond | jumps).double().mean().item()) and share > 0.2
     # Neither: the weights that were cleared last act, under their role.
     found.policies[idle].load_state_dict(wild)
-    last = found.steps["interact"].clearance.choose(live, 5)
+    last = found.steps["interact"].supervisor.choose(live, 5)
     assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
     assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
     assert after(found)["live"] == idle
