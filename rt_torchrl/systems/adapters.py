@@ -244,8 +244,8 @@ class FMUEnvironment(ForeignSystem):
         return description, {variable.name: variable.valueReference for variable in real}
 
     def _require(self, names: Mapping[str, Sequence[str]]) -> None:
-        for what, wanted in names.items():
-            unknown = [name for name in wanted if name not in self._places]
+        for what, variables in names.items():
+            unknown = [name for name in variables if name not in self._places]
             if unknown:
                 raise ValueError(
                     f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "

@@ -123,10 +123,10 @@ class EpisodeCollector(BaseCollector):
 
     def _begin(self) -> TensorDictBase:
         pass_over(self.env)
-        begun = self.env.reset()
+        first_row = self.env.reset()
         if not isinstance(self.actor.policy, StateFeedback):
-            require_pure_policy(self.actor.policy, begun["observation"])
-        return begun
+            require_pure_policy(self.actor.policy, first_row["observation"])
+        return first_row
 
 
 def fly(
@@ -158,9 +158,9 @@ def fly(
     except Exception as error:  # whatever a machine, its driver or its connection may raise
         return flown, failure(error, plant)
     for k in range(plant.n_steps):
-        asked = act(k, row)
+        row_with_action = act(k, row)
         try:
-            stepped = env.step(asked)
+            stepped = env.step(row_with_action)
         except DivergenceError:
             raise
         except Exception as error:
@@ -188,8 +188,8 @@ def failure(error: Exception, plant: Plant, interval: int | None = None) -> str:
         interval: number of the control interval in the episode; None for a reset.
     """
     where = "in its reset" if interval is None else f"in interval {interval}, at {interval * plant.dt:g} s"
-    said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-    return f"the system failed {where}: {said}"
+    message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return f"the system failed {where}: {message}"
 
 
 class FlightCollector(EpisodeCollector):
@@ -225,8 +225,8 @@ class FlightCollector(EpisodeCollector):
         drive = drive_of(plant, exogenous, torch.cat([noise, factors[:, :-1]], -1))
         start = initial_state
         if law is not None:
-            felt = (start * factors[:, 0])[..., : len(plant.readings)]
-            start = torch.cat([start, law.first_memory(felt)], -1)
+            readings = (start * factors[:, 0])[..., : len(plant.readings)]
+            start = torch.cat([start, law.first_memory(readings)], -1)
         kind = ExploringInterval if law is None else ExploringController
         interval = kind(plant, closure, self.actor, policy)
         carries = torch.cat([start.unsqueeze(0), self._engine.end_states(interval, start, drive)])
@@ -288,20 +288,20 @@ def flown(
     # There is no input after the last interval; the last input takes its place.
     exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
-    felt = states * factors
-    seen = {"state": felt[..., : len(plant.readings)], "exogenous": exogenous}
-    seen["observation"] = plant.observe(t, felt, exogenous)
-    seen["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])
-    begun = {
+    measured = states * factors
+    entries = {"state": measured[..., : len(plant.readings)], "exogenous": exogenous}
+    entries["observation"] = plant.observe(t, measured, exogenous)
+    entries["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])
+    flags = {
         key: torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)
         for key in ("done", "truncated", "terminated")
     }
-    ended = {key: never.clone() for key, never in begun.items()} | {"reward": reward.unsqueeze(-1)}
-    ended["done"][-1], ended["truncated"][-1], ended["terminated"][-1] = True, ~over, over
+    final = {key: never.clone() for key, never in flags.items()} | {"reward": reward.unsqueeze(-1)}
+    final["done"][-1], final["truncated"][-1], final["terminated"][-1] = True, ~over, over
     return TensorDict(
-        {key: value[:-1] for key, value in seen.items()}
-        | begun
-        | {"action": command, "next": {key: value[1:] for key, value in seen.items()} | ended},
+        {key: value[:-1] for key, value in entries.items()}
+        | flags
+        | {"action": command, "next": {key: value[1:] for key, value in entries.items()} | final},
         batch_size=reward.shape,
         device=states.device,
     )

@@ -236,15 +236,15 @@ class ForeignSystem(EnvBase):
         return reported.update(ends)
 
 
-def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
+def ended_early(reported: TensorDictBase, count: int, plant: Plant) -> ValueError:
     """The error that says that an environment has ended an episode where its plant does not.
 
     Args:
-        found: the environment's report at the end of the episode.
+        reported: the environment's report at the end of the episode.
         count: number of control intervals until that end.
         plant: plant whose horizon the episode has not reached.
     """
-    terminated = "terminated" in found and found["terminated"].any()
+    terminated = "terminated" in reported and reported["terminated"].any()
     return ValueError(
         f"the environment {'terminated' if terminated else 'truncated'} the episode after {count} of {plant.n_steps} "
         f"control intervals of plant {plant.name!r}, which does not end there. If it may, let the plant say so by "

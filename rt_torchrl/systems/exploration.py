@@ -112,8 +112,8 @@ class LivePolicy(nn.Module):
             ValueError: if state feedback is given no state or exogenous input.
         """
         if not isinstance(policy, StateFeedback):
-            found: Tensor = policy(observation)
-            return found
+            command: Tensor = policy(observation)
+            return command
         if state is None or exogenous is None:
             raise ValueError(f"{type(policy).__name__} acts from state and exogenous input; give both.")
         return policy.act(self._dt * self._intervals, state, exogenous)

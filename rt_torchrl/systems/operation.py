@@ -199,14 +199,14 @@ class Operator:
         """Number of the order that is followed; -1 before the first."""
         return -1 if self._order is None else self._order.version
 
-    def follow(self, order: Order, made: nn.Module | None = None) -> None:
+    def follow(self, order: Order, policy: nn.Module | None = None) -> None:
         """Let the policy of an order take over in the next interval.
 
         Args:
             order: the order.
-            made: its policy, ready to act; None makes it.
+            policy: its policy, ready to act; None makes it.
         """
-        policy = order.ready(self.policies) if made is None else made
+        policy = order.ready(self.policies) if policy is None else policy
         if self._begun:
             self.actor.hand_over(policy, strength=order.strength)
         else:
@@ -251,12 +251,12 @@ class Operator:
             self.actor.begin_window()
             return self.env.go_on()
         pass_over(self.env)
-        begun = self.env.reset()
+        first_row = self.env.reset()
         self.actor.begin(self.actor.policy, strength=self._order.strength)
         if self._keeps_time:
             self.pace.begin()
         self._begun = True
-        return begun
+        return first_row
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on, at the end of a window."""
@@ -358,11 +358,11 @@ class Operation:
         if self._connection is not None:
             return self._connection
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
+        self._connection, acting_end = context.Pipe()
         state = None if self._state is None else pickle.dumps(self._state)
-        self._process = context.Process(target=act, args=(theirs, self._operator, state), daemon=True)
+        self._process = context.Process(target=act, args=(acting_end, self._operator, state), daemon=True)
         self._process.start()
-        theirs.close()
+        acting_end.close()
         for order in self.orders.values():
             if self._state is None or order.version > self._state["order"]["version"]:
                 self._pass_on(order)

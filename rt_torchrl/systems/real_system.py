@@ -127,9 +127,9 @@ def require_numbers(what: str, **values: float | Sequence[float]) -> None:
         ValueError: if an argument is not finite; it names the first one.
     """
     for argument, value in values.items():
-        found = array_of(argument, value)
+        numbers = array_of(argument, value)
         # A plant may have no inputs, but a reading has numbers.
-        if not np.isfinite(found).all() or (found.size == 0 and argument != "exogenous"):
+        if not np.isfinite(numbers).all() or (numbers.size == 0 and argument != "exogenous"):
             raise ValueError(f"{argument}={value} of the {what} must be finite: a number, or one for each signal.")
 
 
@@ -267,8 +267,8 @@ class RealSystem(EnvBase):
             )
 
     def _require_range(self, spec: Bounded) -> None:
-        own = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
-        ends = torch.stack([in_units(end, self._actuation.scale, self._actuation.offset) for end in own])
+        bounds = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
+        ends = torch.stack([in_units(end, self._actuation.scale, self._actuation.offset) for end in bounds])
         for action, low, high in zip(self.plant.actions, ends.amin(0).tolist(), ends.amax(0).tolist(), strict=True):
             slack = 1e-6 * (action.high - action.low)  # bounds in single precision
             if low > action.low + slack or high < action.high - slack:
@@ -379,10 +379,10 @@ class RealSystem(EnvBase):
         self._present = state, exogenous
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
         flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
-        found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
-        found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag), "applied": applied}
-        found |= {"refused": reported["refused"].reshape(1, 1)} if self._judged else {}
-        return TensorDict(found, batch_size=self.batch_size, device=self.device)
+        entries = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
+        entries |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag), "applied": applied}
+        entries |= {"refused": reported["refused"].reshape(1, 1)} if self._judged else {}
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def close(self, **kwargs: Any) -> None:
         """Close the environment too, such as its simulator or its connection."""

@@ -79,9 +79,9 @@ class ActionLimits:
     def __init__(self, spec: TensorSpec, config: SafetyConfig):
         self.spec, low, high = spec, config.low, config.high
         whole = torch.full(spec.shape, torch.inf, dtype=spec.dtype, device=spec.device)
-        own = getattr(spec.space, "low", -whole), getattr(spec.space, "high", whole)
-        self.low = own[0] if low is None else torch.maximum(own[0], self.constant("low", low))
-        self.high = own[1] if high is None else torch.minimum(own[1], self.constant("high", high))
+        system_range = getattr(spec.space, "low", -whole), getattr(spec.space, "high", whole)
+        self.low = system_range[0] if low is None else torch.maximum(system_range[0], self.constant("low", low))
+        self.high = system_range[1] if high is None else torch.minimum(system_range[1], self.constant("high", high))
         if not ((self.low <= self.high) & (self.low < math.inf) & (self.high > -math.inf)).all():
             raise ValueError(f"low={low} and high={high} leave no action of the system's own range {spec.space}.")
         self._increment = None if config.rates is None else config.interval * self.constant("rates", config.rates)
@@ -377,12 +377,12 @@ class SafetyLayer(AroundSystem):
             reading[key] = self._good[key]
         return reading
 
-    def _note(self, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
+    def _note(self, reasons: dict[str, str], requested: Tensor, applied: Tensor) -> None:
         if not reasons:
             return
-        wanted, sent = asked.flatten().tolist(), applied.flatten().tolist()
+        command, sent = requested.flatten().tolist(), applied.flatten().tolist()
         t = self._step_count * self.config.interval
-        event = SafetyEvent(self._episodes - 1, self._step_count, t, reasons, wanted, sent, time.time())
+        event = SafetyEvent(self._episodes - 1, self._step_count, t, reasons, command, sent, time.time())
         self.report.events.append(event)
         self.report.counts.update(reasons.keys())
         if self.config.log is not None and self._unwritten is None:

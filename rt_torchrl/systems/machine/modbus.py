@@ -87,7 +87,7 @@ class ModbusLink:
         self._written = dict(sorted(written.items(), key=lambda item: item[1].address))
         _require_block("written", written)
         ordered = list(self._written.values())
-        if any(one.end != two.address for one, two in zip(ordered, ordered[1:], strict=False)) or any(
+        if any(first.end != second.address for first, second in zip(ordered, ordered[1:], strict=False)) or any(
             register.table == "input" for register in ordered
         ):
             raise ValueError(f"written={dict(written)} must be holding registers one behind the other, without gaps.")
@@ -118,8 +118,8 @@ class ModbusLink:
         words = self._asked(what, request, first, count=count, device_id=self._device).registers
         reading = {}
         for tag, register in self._read.items():
-            there = words[register.address - first : register.end - first]
-            number = self._client.convert_from_registers(there, self._kind(register), register.word_order)
+            register_words = words[register.address - first : register.end - first]
+            number = self._client.convert_from_registers(register_words, self._kind(register), register.word_order)
             reading[tag] = register.scale * number
         return reading
 
