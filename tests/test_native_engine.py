@@ -203,7 +203,7 @@ class Saturated(nn.Module):
 
 @pytest.mark.parametrize("bias", [17.0, 18.36])
 def test_the_rounding_of_a_saturated_policy_is_no_reason_to_refuse_it(bias, monkeypatch):
-    monkeypatch.setattr(code, "_kept", OrderedDict())  # policies of the same kind share their programs
+    monkeypatch.setattr(code, "_codes", OrderedDict())  # policies of the same kind share their programs
     case = case_of(batch=4, n=10)
     case.policy = Saturated(bias)
     case.rollout("native").costs(case.initial_state, case.exogenous).mean().backward()

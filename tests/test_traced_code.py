@@ -73,8 +73,8 @@ def test_refusals_hold_no_tensors():
     with pytest.warns(UserWarning, match="sort"):
         assert code.code_of(case, state, drive) is None
     assert code.code_of(case, state, drive) is None  # without another warning
-    kept = (found for found, _ in code._kept.values())
-    (refusal,) = (found for found in kept if isinstance(found, UntraceableError) and "sort" in str(found))
+    entries = (entry for entry, _ in code._codes.values())
+    (refusal,) = (entry for entry in entries if isinstance(entry, UntraceableError) and "sort" in str(entry))
     assert refusal.__traceback__ is None
 
 
@@ -102,7 +102,7 @@ def counted(monkeypatch):
     """The texts of recurrences that are made, of which none is known yet."""
     made, text = [], code.march_text
     monkeypatch.setattr(code, "march_text", lambda *given: made.append(given) or text(*given))
-    monkeypatch.setattr(code, "_kept", OrderedDict())
+    monkeypatch.setattr(code, "_codes", OrderedDict())
     return made
 
 

@@ -279,7 +279,7 @@ def test_a_weight_may_be_a_number_without_a_dimension(native, monkeypatch):
     own = DigitalTwin(plant, Stiffness())
     twin.closure.load_state_dict({"matrix": torch.tensor([[0.0, 0.0], [-0.2, 0.0]]).double()})
     if not native:
-        monkeypatch.setattr(own.sensitivities._engine, "own_end_states", lambda *given: None)
+        monkeypatch.setattr(own.sensitivities._engine, "native_end_states", lambda *given: None)
     _, whole = twin.sensitivities(*given)  # by the four numbers of the matrix, of which the third is c
     torch.testing.assert_close(own.sensitivities(*given)[1], whole[..., 2:3])
 
@@ -299,7 +299,7 @@ def test_rates_may_solve_linear_equations(native, monkeypatch):
     twin, flown, exogenous = recorded(LinearQuadratic(horizon=1.0))
     solved = DigitalTwin(Solved(horizon=1.0), twin.closure)
     if not native:
-        monkeypatch.setattr(solved.sensitivities._engine, "own_end_states", lambda *given: None)
+        monkeypatch.setattr(solved.sensitivities._engine, "native_end_states", lambda *given: None)
     given = flown.states[:, 0], exogenous, flown.actions
     for found, expected in zip(solved.sensitivities(*given), twin.sensitivities(*given), strict=True):
         torch.testing.assert_close(found, expected)

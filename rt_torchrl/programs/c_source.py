@@ -52,8 +52,8 @@ class CSource:
         needed, writer = [program.operations[i] for i in program.needed(values)], CWriter(self._tables)
         names = {o.attributes: f"{o.attributes[0]}_{o.attributes[1]}" for o in needed if o.name == "input"}
         writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
-        found = Lowering(program, writer, names, "weights").write(values)
-        writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
+        operands = Lowering(program, writer, names, "weights").write(values)
+        writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, operands, strict=True)]
         self.write(head, writer.lines)
 
     def write(self, head: str, lines: Sequence[str]) -> None:
@@ -107,13 +107,13 @@ class CWriter:
         return self._new("double", f"[{size}]")
 
     def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str:
-        found = []
+        summands = []
         for stride, i in terms:
             if i.isdigit():
                 base += stride * int(i)
             else:
-                found.append(i if stride == 1 else f"{stride} * {i if i.isidentifier() else f'({i})'}")
-        return " + ".join([*found, *([str(base)] if base or not found else [])])
+                summands.append(i if stride == 1 else f"{stride} * {i if i.isidentifier() else f'({i})'}")
+        return " + ".join([*summands, *([str(base)] if base or not summands else [])])
 
     def load(self, array: str, index: str, *, shared: bool = False) -> str:
         return f"{array}[{index}]"

@@ -67,12 +67,12 @@ PARTS = {
     types.CellType: ("cell_contents",),
 }
 """Attributes that hold what an object is made of."""
-MADE_BY = {"abc", "types"}
+FACTORIES = {"abc", "types"}
 """Modules that classes name as theirs which are made by a call, whoever calls."""
 LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "sympy", "opt_einsum", "jaxtyping", "beartype"}
-FOREIGN = (sys.stdlib_module_names - MADE_BY) | LIBRARIES
+FOREIGN = (sys.stdlib_module_names - FACTORIES) | LIBRARIES
 """Packages whose globals do not change."""
-OWN = __name__.partition(".")[0]
+THIS_PACKAGE = __name__.partition(".")[0]
 GENERATED = "<@beartype"
 """Files of code that checks annotations at run time."""
 ATTRIBUTES = ("LOAD_ATTR", "LOAD_METHOD", "LOAD_SUPER_ATTR")
@@ -83,7 +83,7 @@ MISSING = object()
 def foreign(module: str | None) -> bool:
     """Whether a module belongs to a package whose globals do not change; those of this library's plants may."""
     package, _, rest = (module or "").partition(".")
-    return module is None or package in FOREIGN or (package == OWN and not rest.startswith("envs"))
+    return module is None or package in FOREIGN or (package == THIS_PACKAGE and not rest.startswith("envs"))
 
 
 def inputs_of(module: nn.Module) -> dict[str, Tensor]:
@@ -292,8 +292,8 @@ class Executed:
 
 def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
     name = held.get("__name__")
-    made = name in MADE_BY or code.co_filename.startswith(GENERATED) or str(name).startswith("namedtuple_")
-    return foreign(name) or made
+    generated = name in FACTORIES or code.co_filename.startswith(GENERATED) or str(name).startswith("namedtuple_")
+    return foreign(name) or generated
 
 
 def outside_of(root: nn.Module, holdings: Holdings, executed: Executed) -> Outside:
@@ -340,8 +340,8 @@ class _Reads:
 
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
-        there, attributes = holder if isinstance(holder, dict) else vars(holder), _names(code).attributes
-        value = there[name]
+        namespace, attributes = holder if isinstance(holder, dict) else vars(holder), _names(code).attributes
+        value = namespace[name]
         if value is os.environ or value is os.getenv or (value is os and attributes & {*ENVIRONMENT}):
             raise _refusal(code, "the environment (os.environ)")
         if isinstance(value, types.ModuleType) and foreign(value.__name__):
@@ -355,7 +355,7 @@ class _Reads:
             self._note_function(value)
             if isinstance(holder, type):
                 self.outside.add_class(holder)
-            self.outside.entries.append((there, name))
+            self.outside.entries.append((namespace, name))
             self.outside.constants += [value] if followed else []
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
@@ -365,8 +365,8 @@ class _Reads:
 
     def _class_attributes(self, x: object, named: dict[str, types.CodeType]) -> None:
         """Judge what the class of an object holds under names of attributes that executed code reads."""
-        kind, own = (x, {}) if isinstance(x, type) else (type(x), getattr(x, "__dict__", {}))
-        for name in () if foreign(kind.__module__) else named.keys() - own.keys():
+        kind, attributes = (x, {}) if isinstance(x, type) else (type(x), getattr(x, "__dict__", {}))
+        for name in () if foreign(kind.__module__) else named.keys() - attributes.keys():
             owner = next((k for k in kind.__mro__ if name in vars(k)), object)
             if not foreign(owner.__module__) and (id(owner), name) not in self._judged:
                 self._take(named[name], owner, name, f"the class attribute {owner.__name__}.")
@@ -501,7 +501,7 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
     first = answers[-1].answer[0]  # of the module itself
     if not _equal([first], again[-1].answer):
         pairs = zip(answers, again, strict=False)
-        culprit = next((a.module for a, b in pairs if a.asks_as(b) and not _equal(a.answer, b.answer)), module)
+        culprit = next((a.module for a, b in pairs if a.same_question(b) and not _equal(a.answer, b.answer)), module)
         path = next(path for path, held in module.named_modules() if held is culprit)
         raise ImpureError(
             f"{_called(module, path)} gives something else when it is called again with the same arguments. {PURE}."
@@ -525,21 +525,21 @@ class _Answer(NamedTuple):
     """What a module was asked, and what it answered."""
 
     module: nn.Module
-    given: list[Tensor]
+    arguments: list[Tensor]
     answer: list[Tensor]
 
-    def asks_as(self, other: "_Answer") -> bool:
-        return self.module is other.module and _equal(self.given, other.given)
+    def same_question(self, other: "_Answer") -> bool:
+        return self.module is other.module and _equal(self.arguments, other.arguments)
 
 
 def _answers(module: nn.Module, arguments: tuple[Any, ...]) -> list[_Answer]:
     """The answers of a module and of those within it, of which the inner ones come first."""
     answers, here = list[_Answer](), threading.get_ident()
 
-    def note(asked: nn.Module, given: object, answer: object) -> None:
+    def note(submodule: nn.Module, args: object, answer: object) -> None:
         if threading.get_ident() == here:
-            tensors = ([x.detach().clone() for x in tree_leaves(xs) if isinstance(x, Tensor)] for xs in (given, answer))
-            answers.append(_Answer(asked, *tensors))
+            tensors = ([x.detach().clone() for x in tree_leaves(xs) if isinstance(x, Tensor)] for xs in (args, answer))
+            answers.append(_Answer(submodule, *tensors))
 
     handle = register_module_forward_hook(note)
     try:

@@ -70,15 +70,15 @@ class Lowering:
         if name == "constant":
             return
         if name == "input":
-            found = self._inputs[attributes]
+            operand = self._inputs[attributes]
         elif name == "element":
-            found = self._load(operands[0], attributes[0])
+            operand = self._load(operands[0], attributes[0])
         elif name == "look_up":
             array, offset, shared = self._arrays[operands[0]]
-            found = writer.look_up(array, self.operand(operands[1]), offset + attributes[0], shared=shared)
+            operand = writer.look_up(array, self.operand(operands[1]), offset + attributes[0], shared=shared)
         else:
-            found = writer.compute(name, *map(self.operand, operands), truth=p.kinds[value] == "truth")
-        self._operands[value] = found
+            operand = writer.compute(name, *map(self.operand, operands), truth=p.kinds[value] == "truth")
+        self._operands[value] = operand
 
     def _load(self, value: int, place: int, terms: Sequence[tuple[int, str]] = ()) -> str:
         """An element of an array that has been written."""
@@ -109,8 +109,8 @@ class Lowering:
             accesses = [access and Access(access.base, (1,)) for access in accesses]
         with self._loops(dims) as indices:
             read = {("x", k): self._read(*pair, indices) for k, pair in enumerate(zip(operands, accesses, strict=True))}
-            found = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
-            (result,) = Lowering(body, self.writer, read, "").write([body.as_number(found)])
+            value = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
+            (result,) = Lowering(body, self.writer, read, "").write([body.as_number(value)])
             self.writer.store(array, self.writer.index(0, [*zip(strides, indices, strict=True)]), result)
 
     def _product(self, array: str, operands: Sequence[int], dims: Sequence[int], k: int, accesses: Accesses) -> None:
@@ -157,8 +157,8 @@ class Lowering:
             if len(rest) >= SHORT:
                 walk = Access(operations[first].attributes[0], (1,))
                 with self.writer.loop(1 + len(rest)) as i:
-                    found = self._read(operations[first].operands[0], walk, [i])
-                    self._add(array, self.writer.index(first, [(1, i)]), found)
+                    operand = self._read(operations[first].operands[0], walk, [i])
+                    self._add(array, self.writer.index(first, [(1, i)]), operand)
             else:
                 for j in (first, *rest):
                     if self.program.numbers.get(outputs[j]) != 0.0:

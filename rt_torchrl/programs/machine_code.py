@@ -81,11 +81,11 @@ def lanes_of_this_machine() -> Lanes:
 def symbol(name: str, lanes: Lanes) -> str | None:
     """The C library's vector function for these lanes, made known to LLVM; None where the library has none."""
     library = _vector_library()
-    found = f"_ZGV{lanes.variant}N{lanes.number}{'v' * FUNCTIONS[name]}_{name}"
-    if library is None or not lanes.variant or not hasattr(library, found):
+    mangled = f"_ZGV{lanes.variant}N{lanes.number}{'v' * FUNCTIONS[name]}_{name}"
+    if library is None or not lanes.variant or not hasattr(library, mangled):
         return None
-    _publish(library, found)
-    return found
+    _publish(library, mangled)
+    return mangled
 
 
 @cache
@@ -151,9 +151,9 @@ class LaneWriter:
             return self._call(vector_function, self.vector, operands)
         result = "poison"
         for lane in range(self.lanes.number):
-            given = [self.emit(f"extractelement {self.vector} {a}, i32 {lane}") for a in operands]
-            one = self._call(name, "double", given)
-            result = self.emit(f"insertelement {self.vector} {result}, double {one}, i32 {lane}")
+            arguments = [self.emit(f"extractelement {self.vector} {a}, i32 {lane}") for a in operands]
+            element = self._call(name, "double", arguments)
+            result = self.emit(f"insertelement {self.vector} {result}, double {element}, i32 {lane}")
         return result
 
     def _call(self, name: str, kind: str, operands: Sequence[str]) -> str:
@@ -192,14 +192,14 @@ class LaneWriter:
     def load(self, array: str, index: str, *, shared: bool = False) -> str:
         element, known = ("double", ", !invariant.load !{}") if shared else (self.vector, "")
         place = self.emit(f"getelementptr {element}, ptr {array}, i64 {index}")
-        found = self.emit(f"load {element}, ptr {place}, {WIDTH}{known}")
-        return self._in_all("double", found) if shared else found
+        value = self.emit(f"load {element}, ptr {place}, {WIDTH}{known}")
+        return self._in_all("double", value) if shared else value
 
     def _in_all(self, kind: str, number: str) -> str:
         """A number in every lane."""
         n = self.lanes.number
-        one = self.emit(f"insertelement <{n} x {kind}> poison, {kind} {number}, i32 0")
-        return self.emit(f"shufflevector <{n} x {kind}> {one}, <{n} x {kind}> poison, <{n} x i32> zeroinitializer")
+        first = self.emit(f"insertelement <{n} x {kind}> poison, {kind} {number}, i32 0")
+        return self.emit(f"shufflevector <{n} x {kind}> {first}, <{n} x {kind}> poison, <{n} x i32> zeroinitializer")
 
     def store(self, array: str, index: str, operand: str) -> None:
         place = self.emit(f"getelementptr {self.vector}, ptr {array}, i64 {index}")
@@ -222,10 +222,10 @@ class LaneWriter:
 
     def _gathered(self, places: str) -> str:
         n = self.lanes.number
-        given = f"<{n} x ptr> {places}, i32 8, {self.mask} splat (i1 true), {self.vector} poison"
+        arguments = f"<{n} x ptr> {places}, i32 8, {self.mask} splat (i1 true), {self.vector} poison"
         gather = f"llvm.masked.gather.v{n}f64.v{n}p0"
         self.globals[gather] = f"declare {self.vector} @{gather}(<{n} x ptr>, i32, {self.mask}, {self.vector})"
-        return self.emit(f"call {self.vector} @{gather}({given})")
+        return self.emit(f"call {self.vector} @{gather}({arguments})")
 
     # Loops
 
@@ -245,7 +245,7 @@ class LaneWriter:
 
     def inputs(self, sizes: dict[str, int], k: str) -> dict[tuple[str, int], str]:
         """Drive and state of interval k, see :func:`march_text`."""
-        n, found = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
+        n, inputs = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
         count, row = self._in_all("i64", "%last"), self.emit(f"add nsw i64 {k}, %row")
         lane = self.emit(f"add <{n} x i64> {self._numbers()}, {self._in_all('i64', '%first')}")
         lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
@@ -255,8 +255,8 @@ class LaneWriter:
             start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
             here = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
             distance = self.emit(f"mul <{n} x i64> {lane}, {self._in_all('i64', across)}")
-            found["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
-        return found
+            inputs["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
+        return inputs
 
     def row(self, array: str, count: int, row: str) -> list[str]:
         """The operands in a row of an array of lanes."""
@@ -289,8 +289,8 @@ def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lan
     writer = LaneWriter(lanes, "march")
     with writer.loop("%n") as k:
         inputs = writer.inputs(sizes, k)
-        found = Lowering(program, writer, inputs, "%w").write(ends)
-        writer.store_row("%s", found, writer.emit(f"add nsw i64 {k}, 1"))
+        operands = Lowering(program, writer, inputs, "%w").write(ends)
+        writer.store_row("%s", operands, writer.emit(f"add nsw i64 {k}, 1"))
     return writer.function("march", f"{X}, ptr noalias %s, ptr noalias %w")
 
 

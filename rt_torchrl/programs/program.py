@@ -87,17 +87,17 @@ class Program:
     def constant(self, value: int | float) -> int:
         """A number or a truth value that is known."""
         kind: Kind = "truth" if isinstance(value, bool) else "number"
-        found = self.new("constant", attributes=(kind, float(value).hex()), kind=kind)
-        self.numbers[found] = float(value)
-        return found
+        constant = self.new("constant", attributes=(kind, float(value).hex()), kind=kind)
+        self.numbers[constant] = float(value)
+        return constant
 
     def needed(self, outputs: Iterable[int]) -> list[int]:
         """The values that the outputs depend on, in the order of their computation."""
-        found = set(outputs)
-        for value in range(max(found, default=-1), -1, -1):  # operands come before what is made of them
-            if value in found:
-                found.update(self.operations[value].operands)
-        return sorted(found)
+        needed = set(outputs)
+        for value in range(max(needed, default=-1), -1, -1):  # operands come before what is made of them
+            if value in needed:
+                needed.update(self.operations[value].operands)
+        return sorted(needed)
 
     # Truth values
 
@@ -174,8 +174,8 @@ class Program:
             return self.new("pow", a, b)
         if y == 0.0:
             return one
-        found = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
-        return found if y > 0 else self.apply("div", one, found)
+        power = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
+        return power if y > 0 else self.apply("div", one, power)
 
 
 SIMPLIFIED: dict[str, Callable[..., int]] = {

@@ -53,8 +53,8 @@ def _fold(name: str, empty: float = 0.0) -> Rule:
         if name == "add" and rows.numel() > 4 * STRAIGHT:
             ones = torch.full((rows.shape[1], 1), p.constant(1.0))
             return matrix_product(tracer, rows, ones).view(out.shape)
-        found = [reduce(partial(p.apply, name), row) if row else p.constant(empty) for row in rows.tolist()]
-        return in_shape(found, out.shape)
+        folds = [reduce(partial(p.apply, name), row) if row else p.constant(empty) for row in rows.tolist()]
+        return in_shape(folds, out.shape)
 
     return rule
 
@@ -72,13 +72,13 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
     p, (m, k), n = tracer.program, a.shape, b.shape[1]
     first = torch.full((m, n), p.constant(-0.0)) if start is None else start.expand(m, n)
     if m * k * n <= STRAIGHT_PRODUCT:
-        found = []
+        totals = []
         for row, starts in zip(a.tolist(), first.tolist(), strict=True):
             for column, total in zip(b.t().tolist(), starts, strict=True):
                 for x, y in zip(row, column, strict=True):
                     total = p.apply("add", total, p.apply("mul", x, y))
-                found.append(total)
-        return in_shape(found, (m, n))
+                totals.append(total)
+        return in_shape(totals, (m, n))
     if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
         return first
     return tracer.loop("product", (a, b, first), (m, n), k)
@@ -102,17 +102,17 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
         picked: Tensor = torch.ops.aten.index.Tensor(cells, indices)
         return picked
     array, walk = tracer.access(cells.flatten())
-    nan, rest, found = p.constant(math.nan), math.prod(source.shape[len(given) :]), []
+    nan, rest, values = p.constant(math.nan), math.prod(source.shape[len(given) :]), []
     for place, inside in _places(tracer, source.shape, indices):
         if walk is None:
-            there = [array] * rest
+            elements = [array] * rest
         else:
             (stride,) = walk.strides
             place = p.apply("mul", place, p.constant(float(stride)))
             offsets = [walk.base + stride * r for r in range(rest)]
-            there = [p.new("look_up", array, place, attributes=(offset,)) for offset in offsets]
-        found += [p.select(inside, x, nan) for x in there]
-    return in_shape(found, out.shape)
+            elements = [p.new("look_up", array, place, attributes=(offset,)) for offset in offsets]
+        values += [p.select(inside, x, nan) for x in elements]
+    return in_shape(values, out.shape)
 
 
 def _places(tracer: Tracer, shape: Sequence[int], indices: Sequence[Tensor | None]) -> Iterator[tuple[int, int]]:
@@ -135,27 +135,27 @@ def _places(tracer: Tracer, shape: Sequence[int], indices: Sequence[Tensor | Non
 
 def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     target, indices, values = args[:3]
-    p, found = tracer.program, tracer.cells(target).flatten().tolist()
+    p, cells = tracer.program, tracer.cells(target).flatten().tolist()
     added = (*args[3:], options.get("accumulate", False))[0]
     given = [i for i in indices if i is not None]
     if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
         places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
         assigned = tracer.cells(values).expand(places.shape).flatten().tolist()
         for place, value in zip(places.flatten().tolist(), assigned, strict=True):
-            found[place] = p.apply("add", found[place], value) if added else value
-        return in_shape(found, target.shape)
+            cells[place] = p.apply("add", cells[place], value) if added else value
+        return in_shape(cells, target.shape)
     rest = target.shape[len(given) :]
     at = torch.broadcast_shapes(*(i.shape for i in given))
     rows = tracer.cells(values).expand(*at, *rest).reshape(-1, math.prod(rest)).tolist()
-    if len(rows) * len(found) > SPREAD:
-        raise tracer.refuse(f"an assignment to {len(found)} places that vary", "use torch.where")
+    if len(rows) * len(cells) > SPREAD:
+        raise tracer.refuse(f"an assignment to {len(cells)} places that vary", "use torch.where")
     for (place, inside), row in zip(_places(tracer, target.shape, indices), rows, strict=True):
-        for j, before in enumerate(found):
+        for j, before in enumerate(cells):
             first, r = divmod(j, len(row))
             hit = p.logic("and", inside, p.apply("eq", place, p.constant(float(first * len(row)))))
             new = p.apply("add", before, row[r]) if added else row[r]
-            found[j] = p.select(hit, new, before)
-    return in_shape(found, target.shape)
+            cells[j] = p.select(hit, new, before)
+    return in_shape(cells, target.shape)
 
 
 # Linear equations
@@ -185,22 +185,22 @@ def _eliminated(tracer: Tracer, rows: list[list[int]]) -> list[list[int]]:
             rows[i] = [
                 p.apply("sub", rows[i][j], p.apply("mul", factor, rows[k][j])) if j > k else rows[i][j] for j in width
             ]
-    found: list[list[int]] = []
+    solution: list[list[int]] = []
     for k in reversed(range(n)):
         totals = rows[k][n:]
-        for a, x in zip(rows[k][k + 1 : n], found, strict=True):
+        for a, x in zip(rows[k][k + 1 : n], solution, strict=True):
             totals = [p.apply("sub", total, p.apply("mul", a, y)) for total, y in zip(totals, x, strict=True)]
-        found.insert(0, [p.apply("div", total, rows[k][k]) for total in totals])
-    return found
+        solution.insert(0, [p.apply("div", total, rows[k][k]) for total in totals])
+    return solution
 
 
 def _solve(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
     """X of A X = B; in the place of the factors of A stands A itself, which :func:`_solve_again` takes."""
     A, B = map(tracer.cells, args[:2])
     vector = B.ndim == 1 or (B.ndim == A.ndim - 1 and B.shape == A.shape[:-1])
-    found = _solved(tracer, A, B.unsqueeze(-1) if vector else B, left=options.get("left", True))
+    X = _solved(tracer, A, B.unsqueeze(-1) if vector else B, left=options.get("left", True))
     nothing = [torch.full(x.shape, tracer.program.constant(0)) for x in out[2:]]
-    return [found.squeeze(-1) if vector else found, A, *nothing]
+    return [X.squeeze(-1) if vector else X, A, *nothing]
 
 
 def _solve_again(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -214,8 +214,8 @@ def _solved(tracer: Tracer, A: Tensor, B: Tensor, *, left: bool) -> Tensor:
 
 def _invert(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
     A, p = tracer.cells(args[0]), tracer.program
-    one = torch.tensor([[p.constant(float(i == j)) for j in range(A.shape[-1])] for i in range(A.shape[-1])])
-    return [_eliminate(tracer, A, one), torch.full(out[1].shape, p.constant(0))]
+    identity = torch.tensor([[p.constant(float(i == j)) for j in range(A.shape[-1])] for i in range(A.shape[-1])])
+    return [_eliminate(tracer, A, identity), torch.full(out[1].shape, p.constant(0))]
 
 
 # Copies, carried out on the cells
@@ -325,14 +325,14 @@ def _cumulative(step: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tenso
 def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Callable[..., Any]:
     """Greatest or least number of all, of two tensors, or of each row with its first place; NaN is both."""
 
-    def found(x: Tensor, other: Any = None, keepdim: bool = False) -> Any:
+    def extreme(x: Tensor, other: Any = None, keepdim: bool = False) -> Any:
         if other is None or isinstance(other, Tensor):
             return of_all(x) if other is None else of_two(x, other)
         value = of_all(x, other, keepdim=True)
         place = (~((x == value) | x.isnan())).double().cumprod(other).sum(other, keepdim=True).long()
         return (value, place) if keepdim else (value.squeeze(other), place.squeeze(other))
 
-    return found
+    return extreme
 
 
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {

@@ -54,22 +54,22 @@ class Places:
     """
 
     def __init__(self) -> None:
-        self._own = (*map(_folder, (torch, sys.modules[__package__], jaxtyping)), *GENERATED)
-        self._noted: dict[int, tuple[CodeType, int]] = {}
+        self._internal = (*map(_folder, (torch, sys.modules[__package__], jaxtyping)), *GENERATED)
+        self._lines: dict[int, tuple[CodeType, int]] = {}
 
     def note(self) -> None:
         """Note the line of an operator of a forward pass."""
         if not torch.is_grad_enabled():
             return
-        number, found = torch._C._autograd._get_sequence_nr() - 1, self._innermost()
-        if found is not None and number not in self._noted:  # operators without a gradient draw no number
-            self._noted[number] = found
+        number, place = torch._C._autograd._get_sequence_nr() - 1, self._innermost()
+        if place is not None and number not in self._lines:  # operators without a gradient draw no number
+            self._lines[number] = place
 
     def now(self) -> str:
         """The line of the operator that is executed now, as the end of a message."""
         node = torch._C._current_autograd_node()
-        found = self._noted.get(node._sequence_nr()) if node is not None else None
-        return _in_words(found or self._innermost())
+        place = self._lines.get(node._sequence_nr()) if node is not None else None
+        return _in_words(place or self._innermost())
 
     def of(self, frames: Iterable[tuple[FrameType, int]]) -> str:
         """The last line of the caller's code among frames, as the end of a message."""
@@ -80,7 +80,7 @@ class Places:
         return next(self._outside(walk_stack(sys._getframe(1))), None)
 
     def _outside(self, frames: Iterable[tuple[FrameType, int]]) -> Iterator[tuple[CodeType, int]]:
-        return ((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._own))
+        return ((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._internal))
 
 
 def _in_words(place: tuple[CodeType, int] | None) -> str:
@@ -232,8 +232,8 @@ class Tracer(TorchDispatchMode):
             in_place = func._schema.is_mutable and packet.endswith("_")
             if name in self._decompositions and in_place >= func._schema.is_mutable:
                 with self:
-                    found = self._translated(func, self._decompositions[name], *args, **kwargs)
-                    return args[0].copy_(found) if in_place else found
+                    result = self._translated(func, self._decompositions[name], *args, **kwargs)
+                    return args[0].copy_(result) if in_place else result
             if not known and not in_place and (decomposition := self._of_torch().get(func)):
                 with self:
                     return decomposition(*args, **kwargs)
@@ -269,13 +269,13 @@ class Tracer(TorchDispatchMode):
         written = args[0] if func._schema.is_mutable else out
         if name not in self._rules:
             raise self.refuse(f"torch operator {func} has no translation", OTHERS)
-        found = self._translated(func, self._rules[name], self, args, kwargs, written)
+        result = self._translated(func, self._rules[name], self, args, kwargs, written)
         if func._schema.is_mutable:
             if not func._schema.arguments[0].is_write or len(outs) != 1:
                 raise self.refuse(f"{func} writes into its argument out", "take what it returns")
-            self.cells(args[0]).copy_(found.expand(args[0].shape))
+            self.cells(args[0]).copy_(result.expand(args[0].shape))
             return out
-        for o, cells in zip(outs, found if isinstance(found, (tuple, list)) else [found], strict=True):
+        for o, cells in zip(outs, result if isinstance(result, (tuple, list)) else [result], strict=True):
             self.assign(o, cells)
         return out
 
@@ -296,9 +296,9 @@ class Tracer(TorchDispatchMode):
         operands = [self.cells(a) for a in args[: ARITY[name]]]
         if (alpha := kwargs.get("alpha", 1)) != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)
-        found = self.pointwise(name, operands, out.shape)
+        cells = self.pointwise(name, operands, out.shape)
         rounding = kwargs.get("rounding_mode")
-        return self.pointwise(rounding, [found], out.shape) if rounding else found
+        return self.pointwise(rounding, [cells], out.shape) if rounding else cells
 
     def pointwise(self, name: str, operands: list[Tensor], shape: Iterable[int]) -> Tensor:
         """The cells of an elementwise operator on cells: straight-line code, or one loop over a long row."""
@@ -340,11 +340,11 @@ class Tracer(TorchDispatchMode):
         flat, p = cells.flatten().tolist(), self.program
         if len(set(flat)) == 1:
             return p.as_number(flat[0]), None
-        found = [p.operations[i] for i in flat]
-        if all(o.name == "element" for o in found) and len({o.operands for o in found}) == 1:
-            walk = Access.over(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
+        operations = [p.operations[i] for i in flat]
+        if all(o.name == "element" for o in operations) and len({o.operands for o in operations}) == 1:
+            walk = Access.over(torch.tensor([o.attributes[0] for o in operations]).view(cells.shape))
             if walk is not None:
-                return found[0].operands[0], walk
+                return operations[0].operands[0], walk
         if numbers := self.numbers(cells):
             return self.table(numbers), Access(0, torch.empty(cells.shape).stride())
         array = p.new("row", *map(p.as_number, flat), attributes=(tuple(cells.shape),), kind="array")

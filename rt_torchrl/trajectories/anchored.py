@@ -52,14 +52,14 @@ class Anchored(Extension):
         self.inputs = (*base.inputs, *increments)
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        met, increments = exogenous[..., : self.count], exogenous[..., self.count :]
-        (end, applied), n = self.base.step(t, state, command, met, closure), increments.shape[-1]
+        inputs, increments = exogenous[..., : self.count], exogenous[..., self.count :]
+        (end, applied), n = self.base.step(t, state, command, inputs, closure), increments.shape[-1]
         return Transition(torch.cat([end[..., :n] + increments, end[..., n:]], -1), applied)
 
-    def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
-        if "exogenous" in given:
-            given["exogenous"] = given["exogenous"][..., : self.count]
-        return super().ask(part, method, given)
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
+        if "exogenous" in arguments:
+            arguments["exogenous"] = arguments["exogenous"][..., : self.count]
+        return super().ask(part, method, arguments)
 
 
 class AnchoredReplays:
@@ -94,14 +94,14 @@ class AnchoredReplays:
         self.read: Starts = torch.stack([record.states[0] for record in records])
         self.low, self.high = bounds(twin.plant.actions, device=inputs.device)
         n, increments, counted = inputs.shape[1], [], []
-        for record, met in zip(records, inputs, strict=True):
+        for record, exogenous in zip(records, inputs, strict=True):
             ends, r = believed.followed(record), record.states.shape[-1]
             missed = differences(twin.plant.readings, record.states[1:], ends[1:, :r])
             increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), r)]))
             rest = n - len(record.actions)  # the state in which it ended early
             known = torch.cat([record.states, ends[:, r:]], -1)
             states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (known, record.actions))
-            counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], met[None])))
+            counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], exogenous[None])))
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
         self._seen = list[tuple[State, Tensor, Action]]()
@@ -115,19 +115,19 @@ class AnchoredReplays:
             self.flown = torch.stack([self.actions(policy_of(k)) for k in range(len(records))])
         counts = [len(actions) for _, _, actions in self._seen]
         applied = self._scaled(torch.cat([actions for _, _, actions in self._seen]))
-        own = [row.split([n * len(self.low) for n in counts])[k] for k, row in enumerate(self.flown - applied)]
+        deviations = [row.split([n * len(self.low) for n in counts])[k] for k, row in enumerate(self.flown - applied)]
         self.explored: Costs = torch.stack(
-            [row.square().sum() * sum(counts) / n for row, n in zip(own, counts, strict=True)]
+            [row.square().sum() * sum(counts) / n for row, n in zip(deviations, counts, strict=True)]
         )
 
     def latest(self, count: int) -> "AnchoredReplays":
         """Those of the last episodes, at most as many."""
         if count >= len(self.read):
             return self
-        found = copy.copy(self)
-        found.read, found.inputs, found.anchored = (x[-count:] for x in (self.read, self.inputs, self.anchored))
-        found.offsets, found.flown, found.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
-        return found
+        last = copy.copy(self)
+        last.read, last.inputs, last.anchored = (x[-count:] for x in (self.read, self.inputs, self.anchored))
+        last.offsets, last.flown, last.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
+        return last
 
     def corrections(self, policy: nn.Module) -> Costs:
         r"""The log :math:`c_i = \log\tilde J_i - \log\hat J_i` of what each anchored replay costs over the twin's own.

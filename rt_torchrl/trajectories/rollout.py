@@ -117,12 +117,12 @@ class Rollout:
         # What is replayed runs on after an end, so that only its trajectory says when it ended.
         summed = self.plant.end_cost is None or self.interval.policy is not None
         self._require_pure(self._costed, functional.pad(initial_state, (0, 1)), drive)
-        found = self._engine.costs(self._costed, initial_state, drive) if summed else None
-        if found is not None and all_finite(found):
+        costs = self._engine.costs(self._costed, initial_state, drive) if summed else None
+        if costs is not None and all_finite(costs):
             charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
             if charged:  # the sum holds the change from the first state's
-                found = found + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
-            return found
+                costs = costs + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
+            return costs
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
     def _require_pure(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:

@@ -68,8 +68,8 @@ class RememberingInterval(Interval):
 
     def answer(self, carry: Tensor, drive: Drive) -> tuple[Action, Memory]:
         """The command and the new memory; a subclass may read the drive's command, of any width."""
-        read, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
-        command, memory = self.policy.respond(read, memory, drive.exogenous)
+        state, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
+        command, memory = self.policy.respond(state, memory, drive.exogenous)
         return command, memory
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:
@@ -96,5 +96,5 @@ def commands_along(controller: StateFeedback, flown: Trajectory, dt: float) -> A
     controller.begin()
     inputs = flown.exogenous.unbind(1)
     states = flown.states.unbind(1)[: len(inputs)]
-    asked = enumerate(zip(states, inputs, strict=True))
-    return torch.stack([controller.act(k * dt, state, exogenous) for k, (state, exogenous) in asked], 1)
+    samples = enumerate(zip(states, inputs, strict=True))
+    return torch.stack([controller.act(k * dt, state, exogenous) for k, (state, exogenous) in samples], 1)

@@ -90,14 +90,14 @@ class TwinFlight(Trajectory):
 
 def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
     """Trajectories of equal length without batch dimensions as one batch."""
-    states = torch.stack([each.states for each in trajectories])
-    actions = torch.stack([each.actions for each in trajectories])
-    exogenous = torch.stack([each.exogenous for each in trajectories])
-    starts = [float(each.start) for each in trajectories]
+    states = torch.stack([trajectory.states for trajectory in trajectories])
+    actions = torch.stack([trajectory.actions for trajectory in trajectories])
+    exogenous = torch.stack([trajectory.exogenous for trajectory in trajectories])
+    starts = [float(trajectory.start) for trajectory in trajectories]
     together, seen = len(set(starts)) == 1, None
-    if any(each.seen is not None for each in trajectories):
-        every = torch.ones(states.shape[1], dtype=torch.bool, device=states.device)
-        seen = torch.stack([every if each.seen is None else each.seen for each in trajectories])
+    if any(trajectory.seen is not None for trajectory in trajectories):
+        all_seen = torch.ones(states.shape[1], dtype=torch.bool, device=states.device)
+        seen = torch.stack([all_seen if trajectory.seen is None else trajectory.seen for trajectory in trajectories])
     return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts), seen)
 
 

@@ -207,9 +207,9 @@ class ReadInterval(Interval):
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """The state at the end of the interval."""
-        action, read = drive.command.split((len(self.plant.actions), len(self.plant.readings)), -1)
-        known = torch.cat([read, state[..., read.shape[-1] :]], -1)
-        return self.plant.step(drive.t, known, action, drive.exogenous, self.closure).state
+        action, readings = drive.command.split((len(self.plant.actions), len(self.plant.readings)), -1)
+        start = torch.cat([readings, state[..., readings.shape[-1] :]], -1)
+        return self.plant.step(drive.t, start, action, drive.exogenous, self.closure).state
 
 
 def constant(module: nn.Module) -> nn.Module:
@@ -304,11 +304,11 @@ class Sensitivities:
         S = initial_state.new_zeros(batch, n_s, count)
         if initial:
             S = torch.cat([S, torch.eye(n_s, dtype=S.dtype, device=S.device).expand(batch, -1, -1)], -1)
-        state, found = torch.cat([initial_state, S.flatten(1)], -1), None
+        state, joint_ends = torch.cat([initial_state, S.flatten(1)], -1), None
         if S.shape[-1] <= WIDE:
-            found = self._engine.own_end_states(self._tangent, state, drive)
-        if found is not None:
-            ends, S_ends = found.split([n_s, n_s * S.shape[-1]], -1)
+            joint_ends = self._engine.native_end_states(self._tangent, state, drive)
+        if joint_ends is not None:
+            ends, S_ends = joint_ends.split([n_s, n_s * S.shape[-1]], -1)
             S_ends = S_ends.unflatten(-1, S.shape[1:])
         else:
             ends = self._engine.end_states(self.interval, initial_state, drive)

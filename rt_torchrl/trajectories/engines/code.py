@@ -269,9 +269,9 @@ class IntervalCode:
         sweep(*x, states, np.zeros_like(states), 0, by_state, inputs.row(), by_drive, by_weights, 1)
         rows = torch.ones(len(self.point.state), dtype=torch.bool)
         exact = self._expected(interval, inputs, rows, costate)
-        known = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
-        if not known.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
-            rows = known
+        finite = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
+        if not finite.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
+            rows = finite
             if not rows.any():
                 raise UncomparedError(
                     f"torch has no finite gradient of an interval from the state {self.point.state[0].tolist()}. A "
@@ -294,8 +294,8 @@ class IntervalCode:
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
         with torch.enable_grad(), self._executed.noted():
             end = interval(leaves[0], Drive(*leaves[1:]))
-            given = torch.from_numpy(costate.T)[rows]
-            state, t, *rest = costate_products(end, [*leaves, *inputs.learned], given)
+            costates = torch.from_numpy(costate.T)[rows]
+            state, t, *rest = costate_products(end, [*leaves, *inputs.learned], costates)
         return [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
 
 
@@ -349,9 +349,9 @@ def _read_by(tracer: Tracer, interval: nn.Module, outputs: Iterable[int]) -> set
 
 # Kinds of intervals
 
-_known: "WeakKeyDictionary[nn.Module, tuple[Holdings, Inputs]]" = WeakKeyDictionary()
+_holdings: "WeakKeyDictionary[nn.Module, tuple[Holdings, Inputs]]" = WeakKeyDictionary()
 """What an interval holds, as long as it holds that."""
-_kept: "OrderedDict[tuple[object, ...], tuple[IntervalCode | UntraceableError, tuple[object, ...]]]" = OrderedDict()
+_codes: "OrderedDict[tuple[object, ...], tuple[IntervalCode | UntraceableError, tuple[object, ...]]]" = OrderedDict()
 """The machine code of each kind of interval, or why there is none, with the objects that are known by address."""
 _modes: "WeakKeyDictionary[nn.Module, tuple[bool, ...]]" = WeakKeyDictionary()
 """The modes, training or evaluation, of the modules of an interval when it was found to be a function."""
@@ -372,32 +372,32 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
     if initial_state.device.type != "cpu":
         return None
     with _lock:
-        known = _known.get(interval)
-        if known is None or not known[0].unchanged(interval):
-            known = _known[interval] = Holdings(interval), Inputs(interval)
-        (holdings, inputs), sums = known, getattr(interval, "sums", 0)
+        entry = _holdings.get(interval)
+        if entry is None or not entry[0].unchanged(interval):
+            entry = _holdings[interval] = Holdings(interval), Inputs(interval)
+        (holdings, inputs), sums = entry, getattr(interval, "sums", 0)
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (holdings.digest, lanes_of_this_machine(), *widths)
-        code, alive = _kept.get(key, (None, tuple(holdings.alive)))
+        code, alive = _codes.get(key, (None, tuple(holdings.alive)))
         if isinstance(code, IntervalCode) and not code.outside.same():
             code, alive = None, tuple(holdings.alive)
         driven = any(x.requires_grad for x in drive)
-        wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
-        if code is None or (isinstance(code, IntervalCode) and wanted and driven not in code.sweeps):
+        differentiated = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
+        if code is None or (isinstance(code, IntervalCode) and differentiated and driven not in code.sweeps):
             if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
             point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
-            code = _made(code, key, interval, point, holdings, driven if wanted else None)
+            code = _compiled(code, key, interval, point, holdings, driven if differentiated else None)
             if code is None:
                 return None
-            _kept[key] = code, alive
-            while len(_kept) > KEPT:
-                _kept.popitem(last=False)
-        _kept.move_to_end(key)
+            _codes[key] = code, alive
+            while len(_codes) > KEPT:
+                _codes.popitem(last=False)
+        _codes.move_to_end(key)
         return None if isinstance(code, UntraceableError) else (code, inputs)
 
 
-def _made(
+def _compiled(
     code: IntervalCode | None,
     key: tuple[object, ...],
     interval: nn.Module,

@@ -86,12 +86,12 @@ def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor,
     plant's own closure.
     """
     everywhere = dict(interval.named_parameters(remove_duplicate=False))
-    given = {id(everywhere[name]): tensor for name, tensor in weights.items()}
+    replacements = {id(everywhere[name]): tensor for name, tensor in weights.items()}
     held = {
-        f"{path}.{name}".lstrip("."): given[id(w)]
+        f"{path}.{name}".lstrip("."): replacements[id(w)]
         for path, module in interval.named_modules()  # each module once
         for name, w in module.named_parameters(recurse=False, remove_duplicate=False)
-        if id(w) in given
+        if id(w) in replacements
     }
     end: Tensor = torch.func.functional_call(interval, held, (state, drive), tie_weights=False)
     return end
@@ -105,8 +105,8 @@ def batched(jacobian: Callable[..., Any], in_dims: int | tuple[int | None, ...] 
 
     def of_all(*arguments: Any) -> Any:
         with torch.enable_grad():
-            found = torch.func.vmap(jacobian, in_dims)(*arguments)
-        return found if torch.is_grad_enabled() else tree_map(Tensor.detach, found)
+            jacobians = torch.func.vmap(jacobian, in_dims)(*arguments)
+        return jacobians if torch.is_grad_enabled() else tree_map(Tensor.detach, jacobians)
 
     return of_all
 

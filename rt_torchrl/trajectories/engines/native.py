@@ -44,10 +44,10 @@ class Native(GradientEngine):
         if initial_state.device.type != "cpu":
             require_pure_once(interval, initial_state, drive)
             return Parallel().end_states(interval, initial_state, drive)
-        found = self.own_end_states(interval, initial_state, drive)
-        return Autograd().end_states(interval, initial_state, drive) if found is None else found
+        ends = self.native_end_states(interval, initial_state, drive)
+        return Autograd().end_states(interval, initial_state, drive) if ends is None else ends
 
-    def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
+    def native_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""
         task = self._task(interval, initial_state, drive)
         ends: Tensor | None = None if task is None else _EndStates.apply(task, *task.leaves)
@@ -63,8 +63,8 @@ class Native(GradientEngine):
         return costs
 
     def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
-        found = code_of(interval, initial_state, drive)
-        return found and _Task(*found, initial_state, drive)
+        compiled = code_of(interval, initial_state, drive)
+        return compiled and _Task(*compiled, initial_state, drive)
 
 
 class _Task:
@@ -152,11 +152,11 @@ class _EndStates(torch.autograd.Function):
         ends = np.empty((task.n, *task.initial_state.shape))
 
         for_each_group(task.batch, task.lanes, lambda group: group.scatter(task.march(group)[1:], ends))
-        found = torch.from_numpy(ends)
+        states = torch.from_numpy(ends)
         ctx.task = task
         # What is saved tells autograd when it is changed between forward and backward, the weights too.
-        ctx.save_for_backward(found, *leaves)
-        return found
+        ctx.save_for_backward(states, *leaves)
+        return states
 
     @staticmethod
     @once_differentiable
@@ -178,8 +178,8 @@ class _Costs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
         costs, nothing = np.empty(task.batch), np.zeros((1, task.code.sizes["s"], task.lanes))
-        wanted, driven = enabled and any(ctx.needs_input_grad), any(ctx.needs_input_grad[3:6])
-        gradients = ctx.gradients = _Gradients(task, driven=driven) if wanted else None
+        differentiated, driven = enabled and any(ctx.needs_input_grad), any(ctx.needs_input_grad[3:6])
+        gradients = ctx.gradients = _Gradients(task, driven=driven) if differentiated else None
 
         def work(group: Group) -> None:
             states = task.march(group)

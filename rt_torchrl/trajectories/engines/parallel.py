@@ -61,8 +61,8 @@ class _DiscreteAdjoint(torch.autograd.Function):
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
         jacobians = _jacobians(ctx.interval, starts, drive)
         after = costates(jacobians[1:], cost_gradient)  # λ_1 ... λ_n
-        found = _products(ctx.interval, starts, drive, weights, after)
-        return None, torch.einsum("bji,bj->bi", jacobians[0], after[0]), *found
+        gradients = _products(ctx.interval, starts, drive, weights, after)
+        return None, torch.einsum("bji,bj->bi", jacobians[0], after[0]), *gradients
 
 
 def _products(
@@ -72,14 +72,14 @@ def _products(
 
     The products are computed in pieces, because the tape of an interval holds every unit of a perceptron.
     """
-    found = []
+    products = []
     for states, *driven, costate in _pieces(PIECE, starts, drive, costates.flatten(0, 1)):
         driving = [x.clone().requires_grad_() for x in driven]
         leaves = *driving, *weights
         with torch.enable_grad():
             end = interval(states, Drive(*driving))
-        found.append(costate_products(end, leaves, costate))
-    t, exogenous, command, *of_weights = zip(*found, strict=True)
+        products.append(costate_products(end, leaves, costate))
+    t, exogenous, command, *of_weights = zip(*products, strict=True)
     # t may be the same for all realisations
     of_drive = [
         torch.cat(parts).unflatten(0, starts.shape[:2]).sum_to_size(x.shape)
@@ -124,17 +124,17 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
         starts: states at the starts of the intervals.
         drive: times and inputs of the intervals.
     """
-    found = [function(states, Drive(*driving)) for states, *driving in _pieces(PIECE, starts, drive)]
-    return torch.cat(found).unflatten(0, starts.shape[:2])
+    values = [function(states, Drive(*driving)) for states, *driving in _pieces(PIECE, starts, drive)]
+    return torch.cat(values).unflatten(0, starts.shape[:2])
 
 
 def _jacobians(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
     """∂Φ/∂s at every interval, ``n batch n_s n_s``; an interval is computed once for each row of its Jacobian."""
-    n_s, found = starts.shape[-1], list[Tensor]()
+    n_s, jacobians = starts.shape[-1], list[Tensor]()
     basis = torch.eye(n_s, dtype=starts.dtype, device=starts.device)
     for piece in _pieces(max(1, PIECE // n_s), starts, drive):
         state, *driving = (x.repeat_interleave(n_s, 0) for x in piece)
         with torch.enable_grad():
             end = interval(state.requires_grad_(), Drive(*driving))
-        found += costate_products(end, (state,), basis.repeat(len(state) // n_s, 1))
-    return torch.cat(found).unflatten(0, (*starts.shape[:2], n_s))
+        jacobians += costate_products(end, (state,), basis.repeat(len(state) // n_s, 1))
+    return torch.cat(jacobians).unflatten(0, (*starts.shape[:2], n_s))
