@@ -26,15 +26,15 @@ class Actuator(Extension):
         base: the plant.
         action: name of the action.
         hidden: signals of the hidden states.
-        own: parameters of the true system; None for none.
+        parameters: those of the true system; None for none.
 
     Raises:
         ValueError: if there is no such action.
     """
 
-    def __init__(self, base: Plant, action: str, hidden: Sequence[Signal] = (), own: nn.Module | None = None):
+    def __init__(self, base: Plant, action: str, hidden: Sequence[Signal] = (), parameters: nn.Module | None = None):
         self.place = place_of("action", action, base.actions, base.name)
-        super().__init__(base, hidden, own)
+        super().__init__(base, hidden, parameters)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., 0])
@@ -49,7 +49,7 @@ class Actuator(Extension):
         return position.unsqueeze(-1).expand(*base.shape[:-1], len(self.states) - len(self.base.states))
 
 
-def _asked(base: Plant, action: str) -> Signal:
+def _signal_of(base: Plant, action: str) -> Signal:
     """The signal of what an actuator is asked for."""
     return base.actions[place_of("action", action, base.actions, base.name)]
 
@@ -79,13 +79,13 @@ class LaggedActuator(Actuator):
         if stages < 1:
             raise ValueError(f"stages={stages} of {action} must be at least 1.")
         self.stages = stages
-        signal, ends = _asked(base, action), [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
+        signal, ends = _signal_of(base, action), [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
         hidden = [
             Signal(symbol=f"{signal.symbol}'{end}", name=f"lagged_{action}{end}", unit=signal.unit) for end in ends
         ]
         names, meanings = {f"{action}_lag": "s"}, {f"{action}_lag": f"time constant of {action}"}
-        own = PositiveCoefficients([time_constant], names=names, meanings=meanings, factor=FACTOR)
-        super().__init__(base, action, hidden, own)
+        parameters = PositiveCoefficients([time_constant], names=names, meanings=meanings, factor=FACTOR)
+        super().__init__(base, action, hidden, parameters)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         steps = self.dt * self.stages / self.coefficients(closure)[0]
@@ -125,7 +125,7 @@ class ResonantActuator(Actuator):
     """
 
     def __init__(self, base: Plant, action: str, frequency: float, damping: float):
-        signal = _asked(base, action)
+        signal = _signal_of(base, action)
         if not 0.0 < damping < 1.0:
             raise ValueError(f"damping={damping} of {action} must lie in (0, 1); use LaggedActuator beyond.")
         position = Signal(symbol=signal.symbol + "'", name=f"resonant_{action}", unit=signal.unit)
@@ -133,21 +133,21 @@ class ResonantActuator(Actuator):
         names = {f"{action}_frequency": "rad/s", f"{action}_damping_odds": "-"}
         meanings = dict(zip(names, (f"natural frequency of {action}", "zeta/(1 - zeta) of it"), strict=True))
         odds = damping / (1.0 - damping)
-        own = PositiveCoefficients([frequency, odds], names=names, meanings=meanings, factor=FACTOR)
-        super().__init__(base, action, [position, rate], own)
+        parameters = PositiveCoefficients([frequency, odds], names=names, meanings=meanings, factor=FACTOR)
+        super().__init__(base, action, [position, rate], parameters)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
-        asked, (x, v) = applied[..., self.place], hidden.unbind(-1)
+        demand, (x, v) = applied[..., self.place], hidden.unbind(-1)
         omega, odds = self.coefficients(closure).unbind()
         zeta = odds / (1.0 + odds)
         decay, ringing = zeta * omega, omega * torch.sqrt(1.0 - zeta * zeta)
         left, turn = torch.exp(-decay * self.dt), ringing * self.dt
         cosine, sine = left * torch.cos(turn), left * torch.sin(turn) / ringing
-        off = x - asked
+        off = x - demand
         end = off * (cosine + decay * sine) + v * sine
         rate = v * (cosine - decay * sine) - omega * omega * off * sine
-        mean = asked - (rate - v + 2.0 * decay * (end - off)) / (omega * omega * self.dt)
-        return replaced(applied, self.place, mean), torch.stack([asked + end, rate], -1)
+        mean = demand - (rate - v + 2.0 * decay * (end - off)) / (omega * omega * self.dt)
+        return replaced(applied, self.place, mean), torch.stack([demand + end, rate], -1)
 
     def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
         x, v = hidden.unbind(-1)
@@ -178,7 +178,7 @@ class DelayedActuator(Actuator):
     """
 
     def __init__(self, base: Plant, action: str, delay: float):
-        n, signal = round(delay / base.dt), _asked(base, action)
+        n, signal = round(delay / base.dt), _signal_of(base, action)
         if not (1 <= n <= LONGEST_DELAY and math.isclose(n * base.dt, delay, rel_tol=1e-9)):
             raise ValueError(
                 f"delay={delay} s of {action} must be 1 to {LONGEST_DELAY} control intervals of {base.dt:g} s; "
@@ -236,31 +236,31 @@ class PositionedActuator(Actuator):
     """Unit of the size, after that of the action."""
 
     def __init__(self, base: Plant, action: str, size: float):
-        self.size, signal = size, _asked(base, action)
+        self.size, signal = size, _signal_of(base, action)
         if not 0.0 < size < math.inf:
             raise ValueError(f"size={size} {signal.unit}{self.unit} of {action} must be positive and finite.")
         position = Signal(symbol=signal.symbol + "'", name=f"position_of_{action}", unit=signal.unit)
         super().__init__(base, action, [position])
 
-    def moved(self, x: Cost, asked: Cost) -> Cost:
+    def moved(self, x: Cost, demand: Cost) -> Cost:
         """The position at the end of an interval in which an action is asked for."""
         raise NotImplementedError
 
-    def begun(self, x: Cost, asked: Cost) -> Cost:
+    def initial_position(self, x: Cost, demand: Cost) -> Cost:
         """The position that acts at the start of an interval; by default that of its end: the motion takes no time."""
-        return self.moved(x, asked)
+        return self.moved(x, demand)
 
-    def mean(self, x: Cost, end: Cost, asked: Cost) -> Cost:
+    def mean(self, x: Cost, end: Cost, demand: Cost) -> Cost:
         """The mean position over the interval; by default that of its end."""
         return end
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
-        x, asked = hidden[..., 0], applied[..., self.place]
-        end = self.moved(x, asked)
-        return replaced(applied, self.place, self.mean(x, end, asked)), end.unsqueeze(-1)
+        x, demand = hidden[..., 0], applied[..., self.place]
+        end = self.moved(x, demand)
+        return replaced(applied, self.place, self.mean(x, end, demand)), end.unsqueeze(-1)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, self.begun(hidden[..., 0], applied[..., self.place]))
+        return replaced(applied, self.place, self.initial_position(hidden[..., 0], applied[..., self.place]))
 
 
 class RateLimitedActuator(PositionedActuator):
@@ -272,14 +272,14 @@ class RateLimitedActuator(PositionedActuator):
 
     unit = "/s"
 
-    def moved(self, x: Cost, asked: Cost) -> Cost:
-        return x + (asked - x).clamp(-self.size * self.dt, self.size * self.dt)
+    def moved(self, x: Cost, demand: Cost) -> Cost:
+        return x + (demand - x).clamp(-self.size * self.dt, self.size * self.dt)
 
-    def mean(self, x: Cost, end: Cost, asked: Cost) -> Cost:
-        moving = ((asked - x).abs() / (self.size * self.dt)).clamp(max=1.0)
+    def mean(self, x: Cost, end: Cost, demand: Cost) -> Cost:
+        moving = ((demand - x).abs() / (self.size * self.dt)).clamp(max=1.0)
         return end - 0.5 * moving * (end - x)
 
-    def begun(self, x: Cost, asked: Cost) -> Cost:
+    def initial_position(self, x: Cost, demand: Cost) -> Cost:
         return x
 
 
@@ -289,8 +289,8 @@ class PlayActuator(PositionedActuator):
     The position follows only where the actuator pushes it, :math:`x' = \max(a - b, \min(a + b, x))`. ``size`` is b.
     """
 
-    def moved(self, x: Cost, asked: Cost) -> Cost:
-        return torch.maximum(asked - self.size, torch.minimum(asked + self.size, x))
+    def moved(self, x: Cost, demand: Cost) -> Cost:
+        return torch.maximum(demand - self.size, torch.minimum(demand + self.size, x))
 
 
 class StickingActuator(PositionedActuator):
@@ -299,5 +299,5 @@ class StickingActuator(PositionedActuator):
     It slips to where it is asked for. ``size`` is s.
     """
 
-    def moved(self, x: Cost, asked: Cost) -> Cost:
-        return torch.where((asked - x).abs() > self.size, asked, x)
+    def moved(self, x: Cost, demand: Cost) -> Cost:
+        return torch.where((demand - x).abs() > self.size, demand, x)

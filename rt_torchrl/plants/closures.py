@@ -57,10 +57,10 @@ class PositiveCoefficients(nn.Module):
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
         shape = (len(self.names),)
         if coefficients.shape != shape or not (coefficients.isfinite() & (coefficients > 0.0)).all():
-            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
+            expected = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
             known = f"; those of the real system are {self.true_coefficients}" if self.true_coefficients else ""
             raise ValueError(
-                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and "
+                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {expected}, positive and "
                 f"finite{known}."
             )
         self.factor = factor

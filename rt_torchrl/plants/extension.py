@@ -21,12 +21,12 @@ class ExtendedClosure(nn.Module):
 
     Args:
         base: closure of the plant that is extended.
-        own: parameters of the extension.
+        parameters: parameters of the extension.
     """
 
-    def __init__(self, base: nn.Module, own: nn.Module):
+    def __init__(self, base: nn.Module, parameters: nn.Module):
         super().__init__()
-        self.base, self.own = base, own
+        self.base, self.own = base, parameters
 
     @property
     def names(self) -> dict[str, str]:
@@ -44,9 +44,9 @@ class ExtendedClosure(nn.Module):
         return {name: value for part in parts for name, value in part().items()}
 
     @property
-    def all_own(self) -> list[nn.Module]:
+    def extension_parameters(self) -> list[nn.Module]:
         """The parameters of each of the nested extensions, those of the innermost first."""
-        return [*(self.base.all_own if isinstance(self.base, ExtendedClosure) else ()), self.own]
+        return [*(self.base.extension_parameters if isinstance(self.base, ExtendedClosure) else ()), self.own]
 
     def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
         return self.base(features)
@@ -66,7 +66,7 @@ class Extension(Plant):
     Args:
         base: the plant.
         hidden: signals of the hidden states x.
-        own: parameters w of the true system, which are frozen; None for none. A twin begins with :meth:`fresh` ones.
+        parameters: w of the true system, which are frozen; None for none. A twin begins with :meth:`fresh` ones.
 
     Raises:
         ValueError: if the plant overrides ``step`` as a whole, so that nothing can act between actuator and system, and
@@ -75,7 +75,7 @@ class Extension(Plant):
 
     name = "extension"  # until the plant gives its own
 
-    def __init__(self, base: Plant, hidden: Sequence[Signal], own: nn.Module | None = None):
+    def __init__(self, base: Plant, hidden: Sequence[Signal], parameters: nn.Module | None = None):
         if type(base).step is not Plant.step and type(self).step is Plant.step:
             raise ValueError(
                 f"plant {base.name!r} overrides step(), so that nothing can act between its actuators and its system; "
@@ -86,13 +86,13 @@ class Extension(Plant):
         twice = {signal.name for signal in base.states} & {signal.name for signal in hidden}
         if twice:
             raise ValueError(f"plant {base.name!r} already has the states {', '.join(sorted(twice))}.")
-        closure = base.closure if own is None else ExtendedClosure(base.closure, own.requires_grad_(False))
-        super().__init__(dt=base.dt, horizon=base.horizon, closure=closure)
+        joint = base.closure if parameters is None else ExtendedClosure(base.closure, parameters.requires_grad_(False))
+        super().__init__(dt=base.dt, horizon=base.horizon, closure=joint)
         self.base, self.name, self.unread = base, base.name, base.unread + len(hidden)
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
         self.controller_states, self.memories, self.end_cost = base.controller_states, base.memories, base.end_cost
-        self._parameterised = own is not None
+        self._parameterised = parameters is not None
 
     @property
     def innermost(self) -> Plant:
@@ -152,10 +152,10 @@ class Extension(Plant):
         Raises:
             TypeError: if its parameters are no :class:`PositiveCoefficients`.
         """
-        own = closure.get_submodule("own")
-        if not isinstance(own, PositiveCoefficients):
-            raise TypeError(f"own={type(own).__name__} of {type(self).__name__} must be PositiveCoefficients.")
-        return own.coefficients
+        w = closure.get_submodule("own")
+        if not isinstance(w, PositiveCoefficients):
+            raise TypeError(f"parameters={type(w).__name__} of {type(self).__name__} must be PositiveCoefficients.")
+        return w.coefficients
 
     def law(self, closure: nn.Module) -> nn.Module:
         """The closure that acts on the plant; by default that of the plant."""
@@ -177,42 +177,42 @@ class Extension(Plant):
         """Those of the plant; hidden states, which no sensor reads, are not compared."""
         return (*self.base.discrepancy_scales, *(math.inf,) * (len(self.states) - len(self.base.states)))
 
-    def ask(self, part: str, method: str, given: dict[str, Any]) -> Any:
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
         """What the plant answers when a method is called, in its own states, with what the extension has beside it.
 
         Args:
             part: what the method is about, see :data:`~rt_torchrl.plants.plant.PARTS`.
             method: name of the method.
-            given: arguments by name, in their order.
+            arguments: arguments by name, in their order.
         """
         hidden: Any = None
-        for place in given.keys() & {"state", "states"}:
-            base, hidden = self.split(given[place])
-            given[place] = self.true_state(given[place]) if part == "task" else base
-            if part == "task" and "applied" in given:  # a state for each action, of episodes perhaps one more
-                at = hidden[..., : given["applied"].shape[-2], :] if place == "states" else hidden
-                given["applied"] = self.acting(at, given["applied"])
-        answer = getattr(self.base, method)(*given.values())
+        for place in arguments.keys() & {"state", "states"}:
+            base, hidden = self.split(arguments[place])
+            arguments[place] = self.true_state(arguments[place]) if part == "task" else base
+            if part == "task" and "applied" in arguments:  # a state for each action, of episodes perhaps one more
+                at = hidden[..., : arguments["applied"].shape[-2], :] if place == "states" else hidden
+                arguments["applied"] = self.acting(at, arguments["applied"])
+        answer = getattr(self.base, method)(*arguments.values())
         if part == "memory":
             return self.joined(answer, hidden)
         if part == "start":
             return self.joined(answer, self.rest(answer))
-        return self._with_own(answer) if part == "closure" else answer
+        return self._with_parameters(answer) if part == "closure" else answer
 
     def extended(self, closure: nn.Module) -> nn.Module:
         """A closure of the plant without extensions, with the parameters of all its extensions beside it."""
-        return self._with_own(self.base.extended(closure) if isinstance(self.base, Extension) else closure)
+        return self._with_parameters(self.base.extended(closure) if isinstance(self.base, Extension) else closure)
 
-    def _with_own(self, closure: nn.Module) -> nn.Module:
+    def _with_parameters(self, closure: nn.Module) -> nn.Module:
         return ExtendedClosure(closure, self.fresh()) if self._parameterised else closure
 
 
-def _asked(part: str, method: str) -> Callable[..., Any]:
+def _delegated(part: str, method: str) -> Callable[..., Any]:
     """A method of an extension that asks the plant for its answer."""
     names = tuple(inspect.signature(getattr(Plant, method)).parameters)[1:]
 
-    def answer(extension: Extension, *given: Any, **named: Any) -> Any:
-        values = dict(zip(names, given, strict=False)) | named
+    def answer(extension: Extension, *arguments: Any, **named: Any) -> Any:
+        values = dict(zip(names, arguments, strict=False)) | named
         return extension.ask(part, method, {name: values[name] for name in names})
 
     return answer
@@ -220,7 +220,7 @@ def _asked(part: str, method: str) -> Callable[..., Any]:
 
 for _part, _methods in PARTS.items():
     for _method in _methods:
-        setattr(Extension, _method, _asked(_part, _method))
+        setattr(Extension, _method, _delegated(_part, _method))
 
 
 def replaced(
@@ -256,14 +256,14 @@ class Catalogue(NamedTuple):
         missing = ", ".join(name for name in names if name not in self.systems)
         if missing:
             raise ValueError(f"unknown={tuple(names)}: {missing} does not exist; choose {', '.join(self.systems)}.")
-        found: dict[str, tuple[str, Change]] = {}
+        changes: dict[str, tuple[str, Change]] = {}
         for name in names:
             for part, change in self.systems[name].items():
-                if part in found:
-                    both = f"{found[part][0]} and {name} both change the {part}"
+                if part in changes:
+                    both = f"{changes[part][0]} and {name} both change the {part}"
                     raise ValueError(f"unknown={tuple(names)}: {both}; give one of them.")
-                found[part] = name, change
-        return {part: change for part, (_, change) in found.items()}
+                changes[part] = name, change
+        return {part: change for part, (_, change) in changes.items()}
 
     def __call__(self, plant: Plant, names: Sequence[str]) -> Plant:
         """The plant, which a twin knows, with all that the named systems have beside it.

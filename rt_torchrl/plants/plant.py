@@ -223,9 +223,9 @@ class Plant(nn.Module):
         applied = self.actuate(state, command)
         return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
-    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
+    def at_rest(self, readings: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
-        return read
+        return readings
 
     # Task
 
@@ -237,9 +237,9 @@ class Plant(nn.Module):
         """
         if not self.observed:
             raise NotImplementedError(f"plant {self.name!r} declares no measurements and defines no observe().")
-        seen = [measurement.observed(self, t, state, exogenous) for measurement in self.observed]
-        _, *seen = torch.broadcast_tensors(state[..., 0], *seen)
-        return torch.stack(seen, -1)
+        values = [measurement.observed(self, t, state, exogenous) for measurement in self.observed]
+        _, *values = torch.broadcast_tensors(state[..., 0], *values)
+        return torch.stack(values, -1)
 
     def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         r"""Lagrangian L_a of the control problem; the reward is −L_a.
@@ -405,8 +405,8 @@ def with_memories(plant: Plant, end: State, t: Tensor, measured: State, exogenou
     """The end of an interval, at whose start the controller memorised what was measured and not what was true."""
     if not plant.memories:
         return end
-    kept = plant.memorise(t, measured, exogenous)
-    sources = (kept if signal.name in plant.memories else end for signal in plant.states)
+    memorised = plant.memorise(t, measured, exogenous)
+    sources = (memorised if signal.name in plant.memories else end for signal in plant.states)
     return torch.stack([source[..., k] for k, source in enumerate(sources)], -1)
 
 

@@ -95,23 +95,23 @@ class BiasedSensor(Extension):
         )
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
-        read, _ = self.split(state)
+        readings, _ = self.split(state)
         bias = closure.get_submodule("own")
-        field = self.base.vector_field(t, self.true(read, bias(t)), action, exogenous, self.of_base(closure))
+        field = self.base.vector_field(t, self.true(readings, bias(t)), action, exogenous, self.of_base(closure))
         drift = (bias(t + self.dt) - bias(t)).unsqueeze(-1) / self.dt + torch.zeros_like(field[..., :1])
         return torch.cat([self.true(field, -drift[..., 0]), drift], -1)
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
-        read, _ = self.split(state)
+        readings, _ = self.split(state)
         bias = closure.get_submodule("own")
         now, then = bias(t), bias(t + self.dt)
-        end = self.base.advance(t, self.true(read, now), applied, exogenous, self.of_base(closure))
+        end = self.base.advance(t, self.true(readings, now), applied, exogenous, self.of_base(closure))
         last = then.unsqueeze(-1) + torch.zeros_like(end[..., :1])
         return torch.cat([self.true(end, -then), last], -1)
 
     def true_state(self, state: State) -> Float[Tensor, "*batch n_b"]:
-        read, hidden = self.split(state)
-        return self.true(read, hidden[..., 0])
+        readings, hidden = self.split(state)
+        return self.true(readings, hidden[..., 0])
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Hidden:
         """The bias at the start as the true system has it; a twin's states hold its own from the first interval on."""
@@ -178,24 +178,24 @@ class StackedObservations(Extension):
 
     def memorise(self, t: Time, state: State, exogenous: Input) -> State:
         base, past = self.split(state)
-        seen = self.observe(t, state, exogenous)[..., : past.shape[-1]]
-        return self.joined(self.base.memorise(t, base, exogenous), seen)
+        observations = self.observe(t, state, exogenous)[..., : past.shape[-1]]
+        return self.joined(self.base.memorise(t, base, exogenous), observations)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Hidden:
         """Zeros, in the place of which the first observation is taken at t = 0."""
         zero = torch.zeros_like(base[..., :1])
         return zero.expand(*base.shape[:-1], self.count * len(self.base.observations))
 
-    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
-        return self.joined(self.base.at_rest(read[..., : self._read]), read[..., self._read :])
+    def at_rest(self, readings: Float[Tensor, "*batch n_r"]) -> State:
+        return self.joined(self.base.at_rest(readings[..., : self._read]), readings[..., self._read :])
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """States of the plant from a log, and the observations that follow from them; t is 0 at its first sample."""
         base = self.base.complete_states(measured, exogenous, actions)
         samples = torch.arange(len(base), device=base.device)
-        seen = self.base.observe(self.dt * samples[:-1].to(base), base[:-1], exogenous)
+        observations = self.base.observe(self.dt * samples[:-1].to(base), base[:-1], exogenous)
         before = samples.unsqueeze(-1) - torch.arange(1, self.count + 1, device=base.device)
-        return self.joined(base, seen[before.clamp(min=0)].flatten(-2))
+        return self.joined(base, observations[before.clamp(min=0)].flatten(-2))
 
     def controller_start(self, measured: Tensor, exogenous: Tensor) -> Tensor:
         return torch.cat([self.base.controller_start(measured, exogenous), self.rest(measured)], -1)

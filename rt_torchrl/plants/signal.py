@@ -303,10 +303,10 @@ class StateBounds:
 
     def merit(self, states: Float[Tensor, "batch samples n_s"]) -> dict[str, Float[Tensor, " batch"]]:
         """How often each state is beyond its bounds, and how far at most, in each of some episodes."""
-        found: dict[str, Tensor] = {}
+        merits: dict[str, Tensor] = {}
         for place, signal, low, high in self._bounded:
             values = states[:, 1:, place]
             excess = torch.relu(torch.maximum(low - values, values - high))
-            found[f"{signal.name} outside [%]"] = 100.0 * (excess > 0.0).double().mean(-1)
-            found[f"{signal.name} beyond [{signal.unit}]"] = excess.amax(-1)
-        return found
+            merits[f"{signal.name} outside [%]"] = 100.0 * (excess > 0.0).double().mean(-1)
+            merits[f"{signal.name} beyond [{signal.unit}]"] = excess.amax(-1)
+        return merits

@@ -106,18 +106,18 @@ class NeuralResidual(Extension):
         scaled: list[Range] = []
         for name, (_, signal) in zip(inputs, signals, strict=True):
             scaled += _scaled(signal, given.get(name))
-        own = ResidualRates(scaled, bounds, hidden=hidden, generator=torch.Generator().manual_seed(seed))
-        super().__init__(base, [], own)
+        network = ResidualRates(scaled, bounds, hidden=hidden, generator=torch.Generator().manual_seed(seed))
+        super().__init__(base, [], network)
         self._whole = not base.own_scheme
-        self._seen = signals
+        self._inputs = signals
         names = list(greatest)
         self._rates = [names.index(s.name) if s.name in names else None for s in base.states]
 
     def residual(self, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """What the network adds to the rates of all states [state unit / s]."""
-        met = exogenous + torch.zeros_like(state[..., :1])
-        values, features = torch.cat([action, state, met], -1), []
-        for place, signal in self._seen:
+        inputs = exogenous + torch.zeros_like(state[..., :1])
+        values, features = torch.cat([action, state, inputs], -1), []
+        for place, signal in self._inputs:
             value = values[..., place]
             if signal.periodic:
                 phase = (2.0 * math.pi / signal.period) * value

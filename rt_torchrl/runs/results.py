@@ -186,7 +186,7 @@ def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
         if name != ALONE:
             closure = twin.twins[name].closure
             # A delay of whole intervals has no parameters of its own.
-            parts = closure.all_own if isinstance(closure, ExtendedClosure) else ()
+            parts = closure.extension_parameters if isinstance(closure, ExtendedClosure) else ()
             weights = {key: value for part in parts for key, value in (named_weights(part) or {}).items()}
             described = {key: value for part in parts for key, value in described_weights(part).items()}
             found[name] = {"weight": weight, "weights": weights, "described": described}
