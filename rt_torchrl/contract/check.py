@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import nn
 
-from rt_torchrl.contract.draws import draws, misshapen, modules, seeded, signals, wanted_as
+from rt_torchrl.contract.draws import draws, misshapen, modules, numbers_of, seeded, signals
 from rt_torchrl.contract.gradients_and_tracing import (
     first_line,
     gradients,
@@ -15,7 +15,7 @@ from rt_torchrl.contract.gradients_and_tracing import (
     stability,
     untraceable,
 )
-from rt_torchrl.contract.methods import Calls, costs, ends, judgement, made, method, periods
+from rt_torchrl.contract.methods import Calls, costs, ends, judgement, method, module_methods, periods
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
 
@@ -141,11 +141,11 @@ def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: 
         yield from check(subject, *rest)
     except Exception as error:
         plant, trace = subject.plant if isinstance(subject, Calls) else subject, inspect.trace()
-        own = [k for k, x in enumerate(trace) if x.frame.f_locals.get("self") is plant and hasattr(plant, x.function)]
-        method = name or trace[own[-1] if own else -1].function
-        inside = trace[own[-1] if own else 0 :]
-        theirs = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
-        place = (theirs or inside)[-1]
+        calls = [k for k, x in enumerate(trace) if x.frame.f_locals.get("self") is plant and hasattr(plant, x.function)]
+        method = name or trace[calls[-1] if calls else -1].function
+        inside = trace[calls[-1] if calls else 0 :]
+        frames = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
+        place = (frames or inside)[-1]
         yield (
             f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: {first_line(error)}. "
             f"{REMEDIES.get(method, ANYWHERE)}"
@@ -154,8 +154,8 @@ def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: 
 
 def methods(calls: Calls) -> Iterator[str]:
     """Violations of every method, of the policy and of the neural closure."""
-    for found in (*calls.methods(), *made(calls)):
-        yield from attempt(method, calls, found, name=found.name)
+    for candidate in (*calls.methods(), *module_methods(calls)):
+        yield from attempt(method, calls, candidate, name=candidate.name)
 
 
 def require_controller(name: str, law: object, plant: Plant) -> None:
@@ -178,18 +178,18 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
     memory, exogenous = controller.first_memory(state), plant.draw_exogenous(STATES, seeded(0))[:, 0]
     _require(f"{about}.first_memory returns", memory, size, f"memory_size={size}")
     try:
-        found = controller.law(state, memory, exogenous)
+        result = controller.law(state, memory, exogenous)
     except (IndexError, RuntimeError, TypeError) as error:
         raise ValueError(
             f"{about}.law fails for states of shape {tuple(state.shape)}, a memory of shape {tuple(memory.shape)} and "
             f"inputs of shape {tuple(exogenous.shape)}: {first_line(error)}. It is law(state, memory, exogenous), and "
             f"its memory has as many columns as memory_size={size} says."
         ) from error
-    if not (isinstance(found, tuple) and len(found) == 2):
-        raise ValueError(f"{about}.law returns {type(found).__name__}; give both: return command, memory.")
+    if not (isinstance(result, tuple) and len(result) == 2):
+        raise ValueError(f"{about}.law returns {type(result).__name__}; give both: return command, memory.")
     actions = ", ".join(signal.name for signal in plant.actions)
-    _require(f"{about}.law returns a command,", found[0], len(plant.actions), f"actions {actions}")
-    _require(f"{about}.law returns a memory,", found[1], size, f"memory_size={size}")
+    _require(f"{about}.law returns a command,", result[0], len(plant.actions), f"actions {actions}")
+    _require(f"{about}.law returns a memory,", result[1], size, f"memory_size={size}")
 
 
 def _require(about: str, value: object, columns: int, why: str) -> None:
@@ -197,7 +197,7 @@ def _require(about: str, value: object, columns: int, why: str) -> None:
     shape = (STATES, columns)
     if problem := misshapen(value, shape):
         raise ValueError(
-            f"{about} {problem} for {STATES} states; expected {wanted_as(shape)} ({why}). A column is state[:, :1], "
+            f"{about} {problem} for {STATES} states; expected {numbers_of(shape)} ({why}). A column is state[:, :1], "
             "not state[:, 0]."
         )
 

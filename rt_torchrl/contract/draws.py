@@ -55,15 +55,15 @@ def seeded(seed: int) -> torch.Generator:
 
 def draws(plant: Plant, seed: int) -> Iterator[str]:
     """Violations in shape, precision, range and source of the initial states and of the inputs."""
-    wanted = {
+    expected = {
         "draw_initial_state": ((BATCH, len(plant.states)), plant.states),
         "draw_exogenous": ((BATCH, plant.n_steps, len(plant.inputs)), plant.inputs),
     }
-    for name, (shape, group) in wanted.items():
+    for name, (shape, group) in expected.items():
         draw = partial(getattr(plant, name), BATCH)
         drawn = draw(seeded(seed))
         if problem := misshapen(drawn, shape):
-            yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}; expected {wanted_as(shape)}."
+            yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}; expected {numbers_of(shape)}."
         else:
             yield from _out_of_range(name, drawn, group)
             yield from _other_sources(name, draw, seed)
@@ -81,7 +81,7 @@ def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
     return f"{count} values that are not finite" if count else None
 
 
-def wanted_as(shape: tuple[int, ...]) -> str:
+def numbers_of(shape: tuple[int, ...]) -> str:
     """The expected value, in words for a message."""
     return f"finite numbers of shape {shape} in torch.float64"
 
@@ -114,11 +114,11 @@ def _other_sources(name: str, draw: Callable[[torch.Generator], Tensor], seed: i
 def modules(plant: Plant, seed: int) -> Iterator[str]:
     """Violations in precision and source of the weights of closures and policy, and in the policy's commands."""
     neural = neural_closure_of(plant)
-    made: dict[str, Callable[[torch.Generator], nn.Module]]
-    made = {"closure": lambda generator: plant.closure}
-    made |= {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
-    made |= {} if neural is None else {"make_neural_closure": neural}
-    for name, make in made.items():
+    makers: dict[str, Callable[[torch.Generator], nn.Module]]
+    makers = {"closure": lambda generator: plant.closure}
+    makers |= {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
+    makers |= {} if neural is None else {"make_neural_closure": neural}
+    for name, make in makers.items():
         module = make(seeded(seed))
         if not isinstance(module, nn.Module):
             yield f"{name}: is a {type(module).__name__}; expected a torch.nn.Module."
@@ -131,10 +131,10 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
             yield f"{name}: has no trainable weights; what is learned must be an nn.Parameter with requires_grad."
     # Observations are of order one, as they should be scaled.
     shape = (50, len(plant.actions))
-    seen = 3.0 * torch.rand(50, len(plant.observations), generator=seeded(seed), dtype=torch.float64) - 1.5
-    command = plant.make_policy(seeded(seed))(seen)
+    observations = 3.0 * torch.rand(50, len(plant.observations), generator=seeded(seed), dtype=torch.float64) - 1.5
+    command = plant.make_policy(seeded(seed))(observations)
     if problem := misshapen(command, shape):
-        yield f"make_policy: its commands on 50 observations have {problem}; expected {wanted_as(shape)}."
+        yield f"make_policy: its commands on 50 observations have {problem}; expected {numbers_of(shape)}."
     else:
         yield from _out_of_range("make_policy", command.detach(), plant.actions)
 

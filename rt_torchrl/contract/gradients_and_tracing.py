@@ -82,17 +82,17 @@ def gradients(calls: Calls) -> Iterator[str]:
 
     They are taken at states of flights. A finding under the true closure is not repeated under the twin's closure.
     """
-    arguments, told = calls.some(5), set()
+    arguments, reported = calls.some(5), set()
     latest = {method.name: method for method in calls.methods()}  # under the twin's closure
     for method in calls.methods():
-        if method.name in CHECKED and method.name not in told:
+        if method.name in CHECKED and method.name not in reported:
             for argument in ("state", "command", "applied"):
                 for text in _by_argument(calls, method, arguments, argument) if argument in method.takes else ():
-                    told.add(method.name)
+                    reported.add(method.name)
                     yield text
     for name in ("vector_field", "step"):
         yield from _by_weights(calls, latest[name], arguments, calls.closure, "closure")
-    if "observe" not in told:
+    if "observe" not in reported:
         policy = calls.plant.make_policy(seeded(calls.seed))
         command = calls.commanded_by(policy)
         yield from _by_argument(calls, command, arguments, "state")
@@ -219,10 +219,10 @@ def jacobians(calls: Calls) -> Iterator[str]:
     arguments = calls.some(3)
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
     interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
-    found = jacobians_of(interval, (), *as_one_batch(state.detach(), drive)).unflatten(0, state.shape[:2])
+    vectorised = jacobians_of(interval, (), *as_one_batch(state.detach(), drive)).unflatten(0, state.shape[:2])
     rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
     reverse = torch.stack(rows, -2)
-    gap = ((found - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
+    gap = ((vectorised - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
     if gap > 1e-6:
         yield (
             f"step: its Jacobian by torch.func differs from that by autograd, by {gap:.1e}; an own "

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.contract.draws import misshapen, neural_closure_of, seeded, wanted_as
+from rt_torchrl.contract.draws import misshapen, neural_closure_of, numbers_of, seeded
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.signal import bounds, differences
 from rt_torchrl.programs.contract import PURE
@@ -33,8 +33,8 @@ class Method(NamedTuple):
 
     def outputs(self, arguments: Arguments) -> tuple[Any, ...]:
         """The results of the method for named arguments; arguments that it does not take are ignored."""
-        found = self.call(*(arguments[name] for name in self.takes))
-        return tuple(found) if self.name == "step" and isinstance(found, tuple) else (found,)
+        result = self.call(*(arguments[name] for name in self.takes))
+        return tuple(result) if self.name == "step" and isinstance(result, tuple) else (result,)
 
 
 class Calls:
@@ -84,7 +84,7 @@ class Calls:
         plant = self.plant
         n_s, n_a, n_o = len(plant.states), len(plant.actions), len(plant.observations)
         now, then = ("t", "state", "applied", "exogenous"), ("t", "state", "command", "exogenous")
-        found = [
+        methods = [
             Method("observe", plant.observe, ("t", "state", "exogenous"), {"observation": (n_o,)}),
             Method("running_cost", plant.running_cost, now, {"cost": ()}),
             Method("terminal_cost", plant.terminal_cost, ("state",), {"cost": ()}),
@@ -93,9 +93,9 @@ class Calls:
             Method("latch", plant.latch, ("state", "applied"), {"state": (n_s,)}),
         ]
         for closure in (plant.closure, self.closure):
-            found.append(self.field_under(closure, "vector_field"))
-            found.append(Method("step", _under(plant.step, closure), then, {"state": (n_s,), "applied": (n_a,)}))
-        return found
+            methods.append(self.field_under(closure, "vector_field"))
+            methods.append(Method("step", _under(plant.step, closure), then, {"state": (n_s,), "applied": (n_a,)}))
+        return methods
 
     def field_under(self, closure: nn.Module, name: str) -> Method:
         """The vector field under a closure, by the name that messages blame."""
@@ -108,8 +108,8 @@ class Calls:
 
         def command(t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
             seen = plant.observe(t, state, exogenous)
-            found: Tensor = policy(seen) if seen.ndim > 1 else policy(seen.unsqueeze(0)).squeeze(0)
-            return found
+            action: Tensor = policy(seen) if seen.ndim > 1 else policy(seen.unsqueeze(0)).squeeze(0)
+            return action
 
         return Method("make_policy", command, ("t", "state", "exogenous"), {"command": (len(plant.actions),)})
 
@@ -136,7 +136,7 @@ def _under(method: Callable[..., Any], closure: nn.Module) -> Callable[..., Any]
     return lambda *arguments: method(*arguments, closure)
 
 
-def made(calls: Calls) -> list[Method]:
+def module_methods(calls: Calls) -> list[Method]:
     """The command of the plant's policy and the rates under its neural closure, by what makes them."""
     neural = neural_closure_of(calls.plant)
     closures = [] if neural is None else [calls.field_under(neural(seeded(calls.seed)), "make_neural_closure")]
@@ -168,7 +168,7 @@ def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
             if problem := misshapen(value, (*lead, *trailing)):
                 given = ", ".join(f"{key} {tuple(case[key].shape)}" for key in method.takes)
                 yield (
-                    f"{method.name}: {name} has {problem} for {given}; expected {wanted_as((*lead, *trailing))}. "
+                    f"{method.name}: {name} has {problem} for {given}; expected {numbers_of((*lead, *trailing))}. "
                     "Index the last dimension only (state[..., 0]), and combine tensors that broadcast."
                 )
                 return
@@ -176,15 +176,15 @@ def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
 
 def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
     """A violation if the method changes its arguments, or gives different results for the same arguments."""
-    given = {name: value.clone() for name, value in arguments.items()}
-    first = [value.clone() for value in method.outputs(given)]
-    changed = [name for name in method.takes if not torch.equal(given[name], arguments[name])]
+    copies = {name: value.clone() for name, value in arguments.items()}
+    first = [value.clone() for value in method.outputs(copies)]
+    changed = [name for name in method.takes if not torch.equal(copies[name], arguments[name])]
     if changed:
         yield f"{method.name}: changes its argument {' and '.join(changed)} in place; make a new tensor instead."
         return
-    method.outputs({name: value[1] for name, value in given.items()})
-    method.outputs({name: value[:1].expand_as(value) for name, value in given.items()})
-    if not all(map(torch.equal, first, method.outputs(given))):
+    method.outputs({name: value[1] for name, value in copies.items()})
+    method.outputs({name: value[:1].expand_as(value) for name, value in copies.items()})
+    if not all(map(torch.equal, first, method.outputs(copies))):
         yield f"{method.name}: gives something else when it is called again with the same arguments. {PURE}."
 
 
@@ -195,7 +195,7 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
     for place, (name, (alone, batch, together)) in enumerate(zip(method.gives, outputs, strict=True)):
         size = 1e-6 + together.abs().amax((0, 1))
         pairs = [(together[0], batch), (batch[0], alone), (together[-1, -1], last[place])]
-        gap = max(((first - found).abs() / size).max() for first, found in pairs)
+        gap = max(((first - second).abs() / size).max() for first, second in pairs)
         if gap > TOLERANCE:
             yield (
                 f"{method.name}: {name} of a batch differs from that of its rows one by one, by {gap:.1e} of its size; "
@@ -213,7 +213,7 @@ def judgement(calls: Calls) -> Iterator[str]:
             if problem := misshapen(value, (batch, steps)):
                 yield (
                     f"setpoints: the {what} of {key!r} has {problem} for {batch} episodes of {steps} control "
-                    f"intervals; expected {wanted_as((batch, steps))}."
+                    f"intervals; expected {numbers_of((batch, steps))}."
                 )
     for key, value in calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]).items():
         known = value.nan_to_num() if isinstance(value, Tensor) else value  # which not every episode has
@@ -224,24 +224,24 @@ def judgement(calls: Calls) -> Iterator[str]:
 @torch.no_grad()
 def costs(calls: Calls) -> Iterator[str]:
     """Violations in the signs of the costs, in the applied action of a step, and in commanding that action again."""
-    plant, found = calls.plant, calls.arguments
+    plant, arguments = calls.plant, calls.arguments
     for method in calls.methods():
         if method.name in ("running_cost", "terminal_cost", "discrepancy"):
-            (cost,) = method.outputs(found)
+            (cost,) = method.outputs(arguments)
             if (cost < 0.0).any():
                 k, b = (cost == cost.min()).nonzero()[0].tolist()
                 yield (
-                    f"{method.name}: is {cost.min():.4g} at state {found['state'][k, b].tolist()}; expected no "
+                    f"{method.name}: is {cost.min():.4g} at state {arguments['state'][k, b].tolist()}; expected no "
                     "negative cost: add a constant, or penalise squares of errors."
                 )
-    size = 1e-9 * (1.0 + found["applied"].abs().amax((0, 1)))
-    applied = plant.actuate(found["state"], found["command"])
-    step = plant.step(found["t"], found["state"], found["command"], found["exogenous"], plant.closure)
+    size = 1e-9 * (1.0 + arguments["applied"].abs().amax((0, 1)))
+    applied = plant.actuate(arguments["state"], arguments["command"])
+    step = plant.step(arguments["t"], arguments["state"], arguments["command"], arguments["exogenous"], plant.closure)
     gaps = {
         "step: its applied action is not what actuate(state, command) gives; call actuate in step, because "
         "trajectories report its action": step.applied - applied,
         "actuate: an applied action that is commanded again from the same state becomes another one; records hold "
-        "applied actions, and the twin replays them as commands": plant.actuate(found["state"], applied) - applied,
+        "applied actions, and the twin replays them as commands": plant.actuate(arguments["state"], applied) - applied,
     }
     yield from (f"{text} (up to {gap.abs().max():.4g})." for text, gap in gaps.items() if (gap.abs() > size).any())
 
@@ -255,10 +255,10 @@ def ends(calls: Calls) -> Iterator[str]:
     except ValueError as error:
         yield f"end_cost: {error}"
         return
-    found = plant.ended(state)
-    if found.dtype != torch.bool or found.shape != state.shape[:-1]:
+    ended = plant.ended(state)
+    if ended.dtype != torch.bool or ended.shape != state.shape[:-1]:
         yield (
-            f"ended: returns {found.dtype} of shape {tuple(found.shape)} for states of shape {tuple(state.shape)}; "
+            f"ended: returns {ended.dtype} of shape {tuple(ended.shape)} for states of shape {tuple(state.shape)}; "
             f"expected torch.bool of shape {tuple(state.shape[:-1])}, one answer for each state."
         )
 
@@ -266,12 +266,12 @@ def ends(calls: Calls) -> Iterator[str]:
 @torch.no_grad()
 def periods(calls: Calls) -> Iterator[str]:
     """Methods whose results change with a turn of a periodic state."""
-    plant, found = calls.plant, calls.arguments
+    plant, arguments = calls.plant, calls.arguments
     for k, signal in ((k, signal) for k, signal in enumerate(plant.states) if signal.periodic):
-        turned = found["state"].clone()
+        turned = arguments["state"].clone()
         turned[..., k] += signal.period
         for method in (method for method in calls.methods() if "state" in method.takes):
-            pairs = zip(method.outputs(found), method.outputs(found | {"state": turned}), strict=True)
+            pairs = zip(method.outputs(arguments), method.outputs(arguments | {"state": turned}), strict=True)
             for name, (first, second) in zip(method.gives, pairs, strict=True):
                 gap = differences(plant.states, second, first) if name == "state" else second - first
                 if (gap.abs() > PERIODIC * (1.0 + first.abs())).any():
