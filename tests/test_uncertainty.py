@@ -88,7 +88,7 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         assert found.correlations()[:, 1].isnan().all()
         # The slope in the wind of the record is known, that in any other wind is not.
         slopes = torch.tensor([[1.0, wind], [1.0, wind + 1.0]]).double() * closure.by_weight
-        assert found.untold(slopes).tolist() == [False, True]
+        assert found.undetermined(slopes).tolist() == [False, True]
 
 
 def regression_error(n, dt, *, smooth):

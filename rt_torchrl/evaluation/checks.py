@@ -39,13 +39,13 @@ def engine_gap(
         The gap. It is infinite if the gradient is not finite where autograd's is, and NaN if autograd's is not, of
         which no engine can be off.
     """
-    (gradient, _), (exact, cost) = (_gradient(plant, closure, policy, unseen, one) for one in (engine, "autograd"))
+    (gradient, _), (exact, cost) = (_gradient(plant, closure, policy, unseen, name) for name in (engine, "autograd"))
     if not exact.isfinite().all():
         return math.nan
-    apart, scale = (gradient - exact).norm().item(), max(exact.norm().item(), NEGLIGIBLE * abs(cost))
-    if not math.isfinite(apart):
+    gap, scale = (gradient - exact).norm().item(), max(exact.norm().item(), NEGLIGIBLE * abs(cost))
+    if not math.isfinite(gap):
         return math.inf
-    return apart / scale if apart else 0.0
+    return gap / scale if gap else 0.0
 
 
 def require_agreement(gap: float, engine: Engine, plant: Plant) -> None:
@@ -69,8 +69,8 @@ def _gradient(
     plant: Plant, closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes, engine: Engine
 ) -> tuple[Tensor, float]:
     """The gradient, and the mean cost."""
-    read, exogenous = unseen.initial_state[:2, : len(unseen.plant.readings)], unseen.exogenous[:2, :STEPS]
-    initial_state = plant.at_rest(read)
+    readings, exogenous = unseen.initial_state[:2, : len(unseen.plant.readings)], unseen.exogenous[:2, :STEPS]
+    initial_state = plant.at_rest(readings)
     flown = Rollout(plant, closure, policy, engine=engine)(initial_state, exogenous)
     weights = [w for w in (*closure.parameters(), *policy.parameters()) if w.requires_grad]
     cost = control_cost(plant, flown).mean()
@@ -88,12 +88,12 @@ def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elem
         plant: plant with the closure of the real system.
         record: the real episode.
     """
-    seen = list[Tensor]()
-    hook = plant.closure.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    features = list[Tensor]()
+    hook = plant.closure.register_forward_pre_hook(lambda _, arguments: features.append(arguments[0]))
     clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
     t = record.start + plant.dt * clock
     try:
         plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, plant.closure)
     finally:
         hook.remove()
-    return seen[-1]
+    return features[-1]

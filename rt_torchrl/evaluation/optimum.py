@@ -86,17 +86,17 @@ def exact_optimum(
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
     count = sum(weight.numel() for weight in policies[0].parameters() if weight.requires_grad)
     usual = FOR_PERCEPTRONS if count > DIRECT else FOR_FEW_WEIGHTS
-    asked = {"approach": approach, "iterations": iterations, "polish": polish}
-    effort = {name: usual[name] if number is None else number for name, number in asked.items()}
+    requested = {"approach": approach, "iterations": iterations, "polish": polish}
+    effort = {name: usual[name] if number is None else number for name, number in requested.items()}
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     best, *others = (policies[k] for k in sorted(range(starts), key=costs.__getitem__))
     by_gradients = descend(best, len(unseen.initial_state), effort["polish"])
-    found = [(by_gradients, best)]
+    candidates = [(by_gradients, best)]
     if 0 < count <= DIRECT:
         for policy in (copy.deepcopy(best), *others[:1]):
             by_simplex(unseen.first(few), policy, count * ENOUGH, size=0.3)
-            found.append((by_simplex(unseen, policy, count * POLISH, size=0.05), policy))
-    return Optimum(*min(found, key=lambda pair: pair[0]), costs, by_gradients)
+            candidates.append((by_simplex(unseen, policy, count * POLISH, size=0.05), policy))
+    return Optimum(*min(candidates, key=lambda pair: pair[0]), costs, by_gradients)
 
 
 def by_simplex(unseen: UnseenEpisodes, policy: nn.Module, count: int, *, size: float) -> float:
@@ -125,5 +125,5 @@ def by_simplex(unseen: UnseenEpisodes, policy: nn.Module, count: int, *, size: f
 
     simplex = np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     options = {"maxfev": count, "initial_simplex": simplex, "adaptive": True, "xatol": 1e-6, "fatol": 1e-12}
-    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
-    return cost(found.x)
+    minimum = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
+    return cost(minimum.x)

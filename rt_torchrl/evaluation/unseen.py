@@ -97,9 +97,9 @@ class UnseenEpisodes:
         Args:
             count: number of episodes, at least 2; all of them if there are fewer.
         """
-        found = copy.copy(self)
-        found.initial_state, found.exogenous = self.initial_state[:count], self.exogenous[:count]
-        return found
+        episodes = copy.copy(self)
+        episodes.initial_state, episodes.exogenous = self.initial_state[:count], self.exogenous[:count]
+        return episodes
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
@@ -152,16 +152,16 @@ class UnseenEpisodes:
         if self.closure is None:
             return None
         count, device = self.initial_state.shape[0], self.initial_state.device
-        found = UnseenEpisodes(self.plant, count, device=device, seed=VALIDATION_SEED)
-        found.closure = self.closure
-        return found
+        episodes = UnseenEpisodes(self.plant, count, device=device, seed=VALIDATION_SEED)
+        episodes.closure = self.closure
+        return episodes
 
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities in flown episodes."""
         plant = self.flying
         costs = control_cost(plant, flown)
-        found = plant.merit(flown.states, flown.actions, flown.exogenous)
-        return Judged(costs, found | (self.bounds.merit(flown.states) if self.bounds else {}))
+        merit = plant.merit(flown.states, flown.actions, flown.exogenous)
+        return Judged(costs, merit | (self.bounds.merit(flown.states) if self.bounds else {}))
 
     @torch.no_grad()
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
@@ -187,8 +187,8 @@ class UnseenEpisodes:
             except DivergenceError:
                 if len(some.states) == 1:
                     return some.states.new_full((1,), torch.inf)
-                each = torch.arange(len(some.states), device=some.states.device).split(1)
-                return torch.cat([costs(some.rows(row)) for row in each])
+                rows = torch.arange(len(some.states), device=some.states.device).split(1)
+                return torch.cat([costs(some.rows(row)) for row in rows])
             return identification_cost(physics, replayed, some.states)
 
         return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
@@ -264,12 +264,12 @@ class RealEpisodes(UnseenEpisodes):
         """Fly as many episodes on the real system, whose training episodes then go on as if it had not."""
         if isinstance(policy, RealController):
             return policy.fly_real(self._count, seed=UNSEEN_SEED)
-        kept = self._system.state_dict()
+        state = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
             flown = [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(self._count)]
         finally:
-            self._system.load_state_dict(kept)
+            self._system.load_state_dict(state)
         return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:

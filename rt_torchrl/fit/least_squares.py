@@ -47,7 +47,7 @@ SHORT = 60
 """Number of short segments of a record, which tell whether a twin is unstable."""
 GROWTH = 1e3
 """Factor by which errors of first states grow along the records of a system that is called unstable."""
-APART = 3.0
+DEPARTURE = 3.0
 """Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""
 SHORTENED = 3
 """Factor from one length of segments to the next shorter one."""
@@ -92,12 +92,12 @@ def multi_start(closure: nn.Module, starts: int, descend: Callable[[int], Minimu
         if number > 1:
             move(closure, generator)
         try:
-            found = descend(number)
+            minimum = descend(number)
         except FloatingPointError:  # weights drawn at random may be nonsense
             continue
-        iterations += found.iterations
-        if found.best < least.best:
-            least, best = found, copy.deepcopy(closure.state_dict())
+        iterations += minimum.iterations
+        if minimum.best < least.best:
+            least, best = minimum, copy.deepcopy(closure.state_dict())
     closure.load_state_dict(best)
     return least._replace(iterations=iterations)
 
@@ -161,7 +161,7 @@ def over_segments(
     if not fits:
         raise diverged[0]
     least = torch.stack([errors for _, errors, _ in fits.values()]).amin(0)
-    result, _, weights = next(one for one in fits.values() if (one[1] <= APART * least).all())
+    result, _, weights = next(entry for entry in fits.values() if (entry[1] <= DEPARTURE * least).all())
     closure.load_state_dict(weights)
     return result
 
@@ -335,7 +335,7 @@ class Estimation:
     def _longest(self, records: Sequence[SensorRecord]) -> Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         scatter = scatter_of(self.sensors, records)
-        given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
+        floor = scatter.new_tensor([DEPARTURE * (sensor.noise or 0.0) for sensor in self.sensors])
         lengths, done = [len(record.actions) for record in records], 0
         free, samples = int((self.spread > 0.0).sum()), sum(int(record.seen.sum()) for record in records)
 
@@ -347,9 +347,9 @@ class Estimation:
             done += minimum.iterations
             return minimum, judged(minimum.likelihood).rms
 
-        enough = torch.maximum(EXPLAINED * scatter, given)
-        found = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
-        return found._replace(iterations=done)
+        enough = torch.maximum(EXPLAINED * scatter, floor)
+        minimum = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
+        return minimum._replace(iterations=done)
 
     def unstable(self, records: Sequence[SensorRecord]) -> bool:
         """Whether errors of the first states grow by more than a factor of 1000 along the records.
@@ -530,13 +530,13 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
 def judged(likelihood: Likelihood) -> Judgement:
     """The twin's errors in the samples that exist; infinite, and its readings unknown, if it diverges."""
     records, signals = likelihood.records, [sensor.measurement for sensor in likelihood.sensors]
-    read = torch.cat([record.readings for record in records])
+    measured = torch.cat([record.readings for record in records])
     try:
         readings = likelihood.simulated()
     except DivergenceError:
         unknown = [record.readings * torch.nan for record in records]
         return Judgement(torch.full_like(likelihood.noise, torch.inf), unknown, records)
-    return Judgement(differences(signals, torch.cat(readings), read).square().nanmean(0).sqrt(), readings, records)
+    return Judgement(differences(signals, torch.cat(readings), measured).square().nanmean(0).sqrt(), readings, records)
 
 
 def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:

@@ -47,8 +47,8 @@ class WeightPrior:
         self.start = self.weights().detach().clone()
         held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
         trained = [w for w in closure.parameters() if w.requires_grad]
-        each = [torch.full_like(w.detach().flatten(), float(id(w) in held)) for w in trained]
-        self.held = torch.cat(each) if each else self.start
+        masks = [torch.full_like(w.detach().flatten(), float(id(w) in held)) for w in trained]
+        self.held = torch.cat(masks) if masks else self.start
 
     def weights(self) -> Tensor:
         """The trained weights in one vector."""
@@ -151,7 +151,7 @@ class Likelihood:
         self.spread = torch.full_like(initial.guess[0], math.inf) if spread is None else spread
         self.biases = biases or Offsets(torch.zeros_like(noise), (), noise)
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
-        self._shown = self.weight_count if weights else 0
+        self._unknown_weights = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
         self._states = state_places(twin.plant, self.sensors)
         lengths = [len(record.actions) for record in records]
@@ -171,9 +171,9 @@ class Likelihood:
 
     def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
-        first = self._shown + number * free
-        last = self._shown + self.initial.offsets.numel()
-        ranges = [(0, self._shown), (first, first + free), (last, self.count)]
+        first = self._unknown_weights + number * free
+        last = self._unknown_weights + self.initial.offsets.numel()
+        ranges = [(0, self._unknown_weights), (first, first + free), (last, self.count)]
         return torch.cat([torch.arange(*ends, device=self.noise.device) for ends in ranges])
 
     @property
@@ -183,7 +183,7 @@ class Likelihood:
     @property
     def count(self) -> int:
         """Number of unknowns."""
-        return self._shown + self.initial.offsets.numel() + self.biases.offsets.numel()
+        return self._unknown_weights + self.initial.offsets.numel() + self.biases.offsets.numel()
 
     @property
     def samples(self) -> Int[Tensor, " n_y"]:
@@ -194,12 +194,12 @@ class Likelihood:
         """The stiffness of every unknown about the value at which a prior holds it, and its distance from there."""
         offsets = self.initial.offsets
         stiffness, distance = offsets.new_zeros(self.count), offsets.new_zeros(self.count)
-        of_states = slice(self._shown, self._shown + offsets.numel())
-        each = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
-        stiffness[of_states], distance[of_states] = each.expand_as(offsets).flatten(), offsets.flatten()
-        if self.prior is not None and self._shown:
-            stiffness[: self._shown] = self.prior.stiffness * self.prior.held
-            distance[: self._shown] = self.prior.weights() - self.prior.start
+        of_states = slice(self._unknown_weights, self._unknown_weights + offsets.numel())
+        precisions = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+        stiffness[of_states], distance[of_states] = precisions.expand_as(offsets).flatten(), offsets.flatten()
+        if self.prior is not None and self._unknown_weights:
+            stiffness[: self._unknown_weights] = self.prior.stiffness * self.prior.held
+            distance[: self._unknown_weights] = self.prior.weights() - self.prior.start
         return stiffness, distance
 
     @torch.no_grad()
@@ -217,8 +217,8 @@ class Likelihood:
         ends, S = self.twin.sensitivities(first, group.exogenous, group.actions, start=start, initial=free)
         require_finite(self.plant, ends.transpose(0, 1), first, [closure], start=start, remedy=REMEDY)
         by_weights, by_state = S.split([self.weight_count, S.shape[-1] - self.weight_count], -1)
-        S = by_weights[..., : self._shown]
-        at_start = S.new_zeros(len(first), 1, first.shape[-1], self._shown)
+        S = by_weights[..., : self._unknown_weights]
+        at_start = S.new_zeros(len(first), 1, first.shape[-1], self._unknown_weights)
         if free:
             unit = self.initial.unit.T
             S = torch.cat([S, by_state @ unit], -1)
@@ -237,12 +237,12 @@ class Likelihood:
     def _residuals(self, replay: Replays) -> Residuals:
         group, states, S = replay
         weights = group.seen / self.noise
-        read = self._read(group, states)
-        values = differences([sensor.measurement for sensor in self.sensors], read, group.readings)
+        readings = self._read(group, states)
+        values = differences([sensor.measurement for sensor in self.sensors], readings, group.readings)
         values = torch.where(group.seen, values, 0.0) * weights
         if None in self._states:
-            given = (self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous))
-            jacobian = read_slopes(*given) @ S
+            arguments = (self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous))
+            jacobian = read_slopes(*arguments) @ S
         else:
             jacobian = S[:, :, self._states]
         by_bias = self.biases.unit.T.expand(*values.shape, -1)

@@ -175,7 +175,7 @@ def logged_signals(plant: Plant) -> tuple[Signal, ...]:
     """
     states = logged_states(plant)
     names = {state.name for state in states}
-    others = tuple(one.measurement.signal for name, one in known_sensors(plant).items() if name not in names)
+    others = tuple(sensor.measurement.signal for name, sensor in known_sensors(plant).items() if name not in names)
     return (*states, *plant.actions, *plant.acting_inputs, *others)
 
 
@@ -342,17 +342,17 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Rows:
 def _seconds(series: Any, about: str) -> Any:
     """Durations in seconds, or the seconds of dates since the first one."""
     pd = pandas()
-    text, there = series.astype(str), series.notna()
+    text, present = series.astype(str), series.notna()
     dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
     durations = pd.to_timedelta(text, errors="coerce")
     as_dates = dates.notna().sum() >= durations.notna().sum()
     offset = text.str.contains(WITH_OFFSET)
     faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}
     if as_dates:
-        faults["like the first one: with an offset from UTC, or without"] = offset != offset[there].iloc[0]
+        faults["like the first one: with an offset from UTC, or without"] = offset != offset[present].iloc[0]
     for what, wrong in faults.items():
-        if (wrong & there).any():
-            raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & there, what)}")
+        if (wrong & present).any():
+            raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & present, what)}")
     if not as_dates:
         return durations.dt.total_seconds()
     return (dates - dates.dropna().iloc[0]).dt.total_seconds()

@@ -113,17 +113,17 @@ def hold_out(
     if not 0.0 < share < 1.0:
         raise ValueError(f"held_out={share} must lie between 0 and 1, a share of the log.")
     total = sum(len(segment.actions) for segment in segments)
-    wanted = total - round(share * total)  # intervals to train on
-    training, held_out, seen = [], [], 0
+    train_count = total - round(share * total)  # intervals to train on
+    training, held_out, passed = [], [], 0
     for segment in segments:
         n = len(segment.actions)
-        cut = min(max(wanted - seen, 0), n)
+        cut = min(max(train_count - passed, 0), n)
         cut = 0 if cut < shortest else n if n - cut < shortest else cut
         if cut:
             training.append(segment.part(0, cut, dt))
         if cut < n:
             held_out.append(segment.part(cut, n, dt))
-        seen += n
+        passed += n
     if not (training and held_out):
         raise ValueError(
             f"held_out={share} of {total} control intervals leaves no {shortest} of them to "
@@ -194,11 +194,11 @@ def sensors_in(plant: Plant, log: SensorLog, names: Sequence[str] = ()) -> tuple
     Raises:
         ValueError: if a name is nothing that can be measured, the log has no such column, or it has no sensor at all.
     """
-    found = sensors_of(plant, names or [name for name in known_sensors(plant) if name in log.columns])
-    absent = [sensor.name for sensor in found if sensor.name not in log.columns]
+    sensors = sensors_of(plant, names or [name for name in known_sensors(plant) if name in log.columns])
+    absent = [sensor.name for sensor in sensors if sensor.name not in log.columns]
     if absent:
         raise ValueError(f"sensors={tuple(names)}: the log has no column {', '.join(absent)}; name it by --columns.")
-    return found
+    return sensors
 
 
 def filled(log: SensorLog, plant: Plant, guesses: Mapping[str, float] | None = None) -> SensorLog:
@@ -258,7 +258,7 @@ def logged_readings(
     """
     grid = float(segment.start) + plant.dt * np.arange(len(segment.states))
     rows = _around(log, grid)
-    values = [_samples(one.measurement, log.times[rows], log.columns[one.name][rows], grid, gap) for one in sensors]
+    values = [_samples(s.measurement, log.times[rows], log.columns[s.name][rows], grid, gap) for s in sensors]
     readings = torch.from_numpy(np.stack(values, -1))
     states = segment.states
     return SensorRecord(readings, segment.actions, segment.exogenous, states[0], float(segment.start), course=states)
@@ -278,13 +278,13 @@ def _samples(signal: Signal, times: Rows, values: Rows, grid: Samples, gap: floa
     if len(times) < 2:
         return np.full(len(grid), np.nan)
     values = _unwrapped(signal, values)
-    found = np.interp(grid, times, values, left=np.nan, right=np.nan)
+    interpolated = np.interp(grid, times, values, left=np.nan, right=np.nan)
     slack = ROUNDING * np.median(np.diff(grid))
     after = np.clip(np.searchsorted(times, grid - slack), 1, len(times) - 1)
-    apart = times[after] - times[after - 1]
+    spacing = times[after] - times[after - 1]
     # A row at the instant itself needs no neighbour.
     exact = np.minimum(np.abs(times[after] - grid), np.abs(times[after - 1] - grid)) <= slack
-    found = np.where(exact, np.interp(grid, times, values), found)
+    interpolated = np.where(exact, np.interp(grid, times, values), interpolated)
     nearest = np.rint((times - grid[0]) * (len(grid) - 1) / (grid[-1] - grid[0]))
-    measured = np.isin(np.arange(len(grid)), nearest) & (exact | (apart <= gap * (1.0 + ROUNDING)))
-    return np.asarray(signal.wrapped(np.where(measured, found, np.nan)))
+    measured = np.isin(np.arange(len(grid)), nearest) & (exact | (spacing <= gap * (1.0 + ROUNDING)))
+    return np.asarray(signal.wrapped(np.where(measured, interpolated, np.nan)))

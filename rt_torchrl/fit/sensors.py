@@ -59,19 +59,19 @@ def known_sensors(plant: Plant) -> dict[str, Sensor]:
     plant, its actions and inputs, is known and is no sensor.
     """
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
-    there = {signal.name for signal in plant.states}  # some are there only if they are asked for
-    found = {
+    state_names = {signal.name for signal in plant.states}  # some are there only if they are asked for
+    measured = {
         m.name: Sensor(measurement=m)
         for m in plant.measurements
         if m.name not in driven
         and not isinstance(m.read, Preview)
-        and not (isinstance(m.read, Named) and m.read.name not in there)
+        and not (isinstance(m.read, Named) and m.read.name not in state_names)
     }
     states = {
         signal.name: Sensor(measurement=Measurement.of(signal)) for signal in plant.states if signal.name not in driven
     }
-    own = {name for name in found.keys() & states if found[name].measurement.read != Named(name)}
-    return found | {name: sensor for name, sensor in states.items() if name not in own}
+    overridden = {name for name in measured.keys() & states if measured[name].measurement.read != Named(name)}
+    return measured | {name: sensor for name, sensor in states.items() if name not in overridden}
 
 
 def state_places(plant: Plant, sensors: Sequence[Sensor]) -> list[int | None]:
@@ -129,8 +129,8 @@ def read(
     sensors: Sequence[Sensor], plant: Plant, t: Time, state: State, exogenous: Input
 ) -> Float[Tensor, "*batch n_y"]:
     """What the sensors would read without noise and bias."""
-    found = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
-    return torch.stack([value.expand(state.shape[:-1]) for value in found], -1)
+    values = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
+    return torch.stack([value.expand(state.shape[:-1]) for value in values], -1)
 
 
 def read_slopes(
@@ -194,8 +194,8 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
     readings = read(sensors, plant, t, states, held_to_the_end(exogenous))
     if seen is not None:
         readings = torch.where(seen.unsqueeze(-1), readings, torch.nan)
-    each = zip(readings, actions, exogenous, states, first.tolist(), strict=True)
-    return [SensorRecord(y, a, z, course[0], start, course=course) for y, a, z, course, start in each]
+    rows = zip(readings, actions, exogenous, states, first.tolist(), strict=True)
+    return [SensorRecord(y, a, z, course[0], start, course=course) for y, a, z, course, start in rows]
 
 
 def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:

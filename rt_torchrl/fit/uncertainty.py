@@ -65,8 +65,8 @@ class Uncertainty:
         if errors == "robust":
             M, samples = torch.zeros_like(self.information), 0
             for block in blocks:
-                every = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
-                for scores, seen, places in zip(every, block.seen.any(-1), block.places, strict=True):
+                all_scores = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
+                for scores, seen, places in zip(all_scores, block.seen.any(-1), block.places, strict=True):
                     M[places[:, None], places] += newey_west(scores[seen])
                     samples += int(seen.sum())
             root = self._inverse.root
@@ -89,7 +89,7 @@ class Uncertainty:
         """Covariance of the closure's named values."""
         return self._slopes @ self.weights_covariance @ self._slopes.T
 
-    def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
+    def undetermined(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the data say nothing.
 
         Args:
@@ -99,7 +99,7 @@ class Uncertainty:
 
     def unknown(self) -> list[str]:
         """Names of the values that take part in a direction of which the data say nothing."""
-        return [name for name, one in zip(self.names, self.untold(self._slopes).tolist(), strict=True) if one]
+        return [name for name, free in zip(self.names, self.undetermined(self._slopes).tolist(), strict=True) if free]
 
     def standard_errors(self) -> dict[str, float]:
         """Standard error of every named value; infinite for one of which the data say nothing."""
@@ -109,7 +109,7 @@ class Uncertainty:
     def correlations(self) -> Float[Tensor, "n_named n_named"]:
         """Correlations of the named values; nan for one of which the data say nothing."""
         C = self.named_covariance
-        scale = torch.where(self.untold(self._slopes), math.nan, C.diagonal().sqrt())
+        scale = torch.where(self.undetermined(self._slopes), math.nan, C.diagonal().sqrt())
         return C / torch.outer(scale, scale)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
@@ -119,8 +119,8 @@ class Uncertainty:
             ValueError: if the level does not lie between 0 and 1.
         """
         factor = normal_factor(level)
-        found = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
-        return {name: (value - factor * error, value + factor * error) for (name, error), value in found}
+        pairs = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
+        return {name: (value - factor * error, value + factor * error) for (name, error), value in pairs}
 
     def initial_errors(self) -> Float[Tensor, "records n_s"]:
         """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
@@ -128,30 +128,30 @@ class Uncertainty:
         shape = initial.offsets.shape
         held = slice(n, n + shape.numel())
         variance = self.covariance.diagonal()[held].clone()
-        each = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
-        variance[self._inverse.unknown(each)] = math.inf
-        found = torch.zeros_like(initial.guess)
-        found[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
-        return found
+        axes = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
+        variance[self._inverse.unknown(axes)] = math.inf
+        errors = torch.zeros_like(initial.guess)
+        errors[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
+        return errors
 
     def warnings(self) -> list[str]:
         """What the data cannot tell, in plain words; empty if they tell every value."""
         errors, nothing = self.standard_errors(), self.unknown()
-        found = self._untold(nothing)
+        warnings = self._undetermined(nothing)
         for (name, error), value in zip(errors.items(), self.values.tolist(), strict=True):
             if not math.isinf(error) and error > BAD_SHARE * abs(value):
-                found.append(f"the data hardly tell {name}: {value:.3g} with a standard error of {error:.2g}")
+                warnings.append(f"the data hardly tell {name}: {value:.3g} with a standard error of {error:.2g}")
         R = self.correlations()
         for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():
             if not {self.names[i], self.names[j]} & set(nothing):
                 kept = "ratio" if R[i, j] > 0.0 else "product"
-                found.append(
+                warnings.append(
                     f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kept}, better "
                     f"than each of them (correlation {R[i, j].item():.4f})"
                 )
-        return found
+        return warnings
 
-    def _untold(self, names: list[str]) -> list[str]:
+    def _undetermined(self, names: list[str]) -> list[str]:
         """What to say of values that take part in directions of which the data say nothing."""
         if not names:
             return []
@@ -206,9 +206,9 @@ class InverseInformation(NamedTuple):
         Args:
             slopes: derivatives of each quantity by the unknowns.
         """
-        told = ((slopes @ self.matrix) * slopes).sum(-1).clamp_min(0.0)
+        determined = ((slopes @ self.matrix) * slopes).sum(-1).clamp_min(0.0)
         free = (slopes @ self.null).square().sum(-1)
-        return (free > LEAST_EIGENVALUE * told) | (slopes[..., self.silent] != 0.0).any(-1)
+        return (free > LEAST_EIGENVALUE * determined) | (slopes[..., self.silent] != 0.0).any(-1)
 
 
 def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
@@ -217,21 +217,21 @@ def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
     seen = diagonal > 0.0
     unit = diagonal[seen].sqrt()
     values, vectors = torch.linalg.eigh(H[seen][:, seen] / unit / unit[:, None])
-    shown = values > LEAST_EIGENVALUE
-    every = torch.eye(len(H), dtype=H.dtype, device=H.device)
-    directions = every[:, seen] @ (vectors / unit[:, None])
-    root = directions[:, shown] / values[shown].sqrt()
-    return InverseInformation(root, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
+    significant = values > LEAST_EIGENVALUE
+    identity = torch.eye(len(H), dtype=H.dtype, device=H.device)
+    directions = identity[:, seen] @ (vectors / unit[:, None])
+    root = directions[:, significant] / values[significant].sqrt()
+    return InverseInformation(root, torch.cat([directions[:, ~significant], identity[:, ~seen]], -1), ~seen)
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
     """The matrix M of one segment of n samples, with L = ⌈4 (n/100)^{2/9}⌉."""
     lags = min(math.ceil(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0)), len(scores) - 1)
-    found = scores.T @ scores
+    M = scores.T @ scores
     for lag in range(1, lags + 1):
         product = scores[:-lag].T @ scores[lag:]
-        found = found + (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    return found
+        M = M + (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    return M
 
 
 def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named n_w"]]:

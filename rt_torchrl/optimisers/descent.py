@@ -79,17 +79,17 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     if math.isinf(limit) or not costs.requires_grad:
         return costs.mean()
     weights = [w for w in weights if w.requires_grad]
-    each = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
-    slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
+    gradients = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
+    slopes = [torch.stack(parts) for parts in zip(*gradients, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
     allowed = limit * costs.detach().abs() / norm_of([weight.detach() for weight in weights])
     # A cost of zero says nothing about what is long.
     shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)
-    found = costs.detach().mean()
+    mean = costs.detach().mean()
     for weight, part in zip(weights, slopes, strict=True):
         slope = torch.tensordot(shares, part, 1) / len(costs)
-        found = found + ((weight - weight.detach()) * slope).sum()
-    return found
+        mean = mean + ((weight - weight.detach()) * slope).sum()
+    return mean
 
 
 class Descent:

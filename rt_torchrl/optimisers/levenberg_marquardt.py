@@ -125,10 +125,10 @@ class LevenbergMarquardt:
     def _attempt(self, equations: Callable[[], NormalEquations]) -> NormalEquations | None:
         """The equations at the trial weights; None if the trajectory diverges there, which only refuses the step."""
         try:
-            found = equations()
+            trial = equations()
         except FloatingPointError:
             return None
-        return found if found.cost.isfinite() and found.matrix.isfinite().all() else None
+        return trial if trial.cost.isfinite() and trial.matrix.isfinite().all() else None
 
 
 def _step(current: NormalEquations, damping: float, scale: Tensor) -> Tensor:
