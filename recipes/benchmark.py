@@ -116,8 +116,8 @@ def system_of(name: PlantName, policy: Policy) -> System:
     closure = plant.make_closure(generator).requires_grad_(False)
     if policy == "affine":
         return System(plant, closure, plant.make_policy(generator))
-    made = rt.SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
-    return System(plant, closure, made)
+    network = rt.SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
+    return System(plant, closure, network)
 
 
 def engine_of(engine: rt.Engine, system: System) -> Contender:
@@ -148,8 +148,8 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
         plant, generator = plant_of(name, steps), torch.Generator().manual_seed(1)
         scenario = rt.Scenario(plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator))
         calls = {
-            contender: made(scenario)
-            for contender, made in contenders.items()
+            contender: make(scenario)
+            for contender, make in contenders.items()
             if predicted(rows, contender, steps, batch) <= config.limit
         }
         gradients, first = dict[str, Tensor](), dict[str, float]()

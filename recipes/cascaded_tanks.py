@@ -86,9 +86,9 @@ def simulated(
     """The readings along a record by an identified twin, from a start that the first samples tell."""
     readings, noise = record.readings.clone(), estimate.likelihood.noise
     readings[first:] = torch.nan
-    begun = estimation.fit_initial_states([record._replace(readings=readings)], noise)
-    whole = Likelihood(estimation.twin, [record], estimation.sensors, begun.initial, noise, biases=begun.biases)
-    return whole.simulated()[0]
+    start = estimation.fit_initial_states([record._replace(readings=readings)], noise)
+    likelihood = Likelihood(estimation.twin, [record], estimation.sensors, start.initial, noise, biases=start.biases)
+    return likelihood.simulated()[0]
 
 
 def folds_of(record: rt.SensorRecord, count: int) -> Iterator[tuple[list[rt.SensorRecord], rt.SensorRecord]]:
@@ -156,11 +156,11 @@ def main(config: Config) -> None:
     print("RMS error of the simulated level [V]\n  over the folds of the estimation record:")
     print("\n".join(f"    {name:<12}{rms:8.4f}" for name, rms in folds.items()))
     print(f"  the folds choose the prior {prior:g}")
-    for name, found in {"physics": law, "physics and perceptron": neural}.items():
-        uncertainty = found[1].uncertainty
-        results[name] = {"weights": found[1].after, "intervals": uncertainty.intervals(), "noise": found[1].noise}
+    for name, (estimation, estimate) in {"physics": law, "physics and perceptron": neural}.items():
+        uncertainty = estimate.uncertainty
+        results[name] = {"weights": estimate.after, "intervals": uncertainty.intervals(), "noise": estimate.noise}
         for which, record in records.items():
-            readings = simulated(*found, record)
+            readings = simulated(estimation, estimate, record)
             rms = (record.readings - readings).square().mean().sqrt().item()
             results[name][which] = {"rms": rms}
             print(f"  {name}, {which} record: {rms:.4f}")

@@ -90,11 +90,11 @@ class Cascade(rt.ClassicalController):
         (outer, inner), (speed, current) = self.gains.unbind(), state.split(1, -1)
         lack = INERTIA * (exogenous - speed)
         torque = outer * lack + memory[:, :1]
-        wanted = (torch.relu(torque) / EXCITATION).sqrt().clamp(max=CURRENT)
-        off = INDUCTANCE * (wanted - current)
+        reference = (torch.relu(torque) / EXCITATION).sqrt().clamp(max=CURRENT)
+        off = INDUCTANCE * (reference - current)
         command = inner * off + EXCITATION * speed * current + memory[:, 1:]
         free = (command > 0.0) & (command < VOLTAGE)  # at an end of a range, the integrals stand still
-        inside = free & (torque > 0.0) & (wanted < CURRENT)
+        inside = free & (torque > 0.0) & (reference < CURRENT)
         integrals = torch.cat([inside * outer**2 * lack, free * inner**2 * off], -1)
         return command, memory + 0.25 * self.plant.dt * integrals
 

@@ -107,8 +107,8 @@ def written(config: Config, run: rt.LoadedRun, output: Path, what: str, kind: st
     path = output / (f"{file}_discon.c" if kind == "discon" else f"{name}.{kind}")
     named = {"function" if what == "policy" else "name": name} if kind in ("c", "discon") else {}
     error = FORMATS[what][kind](part, path, plant, **named)
-    found = "not checked" if error is None else f"within {error:.1e} of the {SIZES[what]}"
-    return f"{path}: {found}" + (f"; the twin with {beside}, which explains the records best" if beside else "")
+    agreement = "not checked" if error is None else f"within {error:.1e} of the {SIZES[what]}"
+    return f"{path}: {agreement}" + (f"; the twin with {beside}, which explains the records best" if beside else "")
 
 
 if __name__ == "__main__":

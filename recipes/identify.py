@@ -86,14 +86,14 @@ class Config:
 
     def guesses(self) -> dict[str, float]:
         """First guesses of hidden states, by name."""
-        found = {}
+        guesses = {}
         for text in self.guess:
             name, _, value = text.partition("=")
             try:
-                found[name] = float(value)
+                guesses[name] = float(value)
             except ValueError:
                 raise ValueError(f"guess={text!r} is not understood; write STATE=VALUE, such as wall=15.") from None
-        return found
+        return guesses
 
     def make_folder(self, plant: str) -> Path:
         """Create the folder of the results and return its path.
@@ -104,9 +104,9 @@ class Config:
         from rt_torchrl.runs.run_folder import WRITTEN  # here, because --help need not wait for TorchRL
 
         folder = self.log_dir or new_folder(Path("runs") / "identify" / plant)
-        there = [name for name in WRITTEN if (folder / name).exists()]
-        if there:
-            raise ValueError(f"log_dir={folder} holds results already ({', '.join(there)}); choose another folder.")
+        present = [name for name in WRITTEN if (folder / name).exists()]
+        if present:
+            raise ValueError(f"log_dir={folder} holds results already ({', '.join(present)}); choose another folder.")
         make_folder("log_dir", folder / "figures")
         return folder
 
@@ -130,17 +130,17 @@ def main(config: Config) -> None:
     spread = resampling.initial_spread(plant, log)
     task = rt.Estimation(rt.DigitalTwin(plant, closure), sensors, spread=spread, config=config.estimation)
     records = [[resampling.logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
-    found = identify(task, *records)
+    identified = identify(task, *records)
     described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
-    metrics = {"plant": plant.name} | metrics_of(found) | {"log": described, "config": dataclasses.asdict(config)}
+    metrics = {"plant": plant.name} | metrics_of(identified) | {"log": described, "config": dataclasses.asdict(config)}
     for side, segments in zip(("training", "held_out"), split, strict=True):
         metrics[side]["seconds"] = plant.dt * sum(len(segment.actions) for segment in segments)
     metrics["held_back"] = held_back(plant, parts.segments)
     write_json(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     drawn = {
-        "twin_and_log": charts.twin_and_sensors(found),
-        "correlations": charts.correlations(found.estimate.uncertainty),
+        "twin_and_log": charts.twin_and_sensors(identified),
+        "correlations": charts.correlations(identified.estimate.uncertainty),
     }
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
@@ -148,17 +148,17 @@ def main(config: Config) -> None:
     print(f"results in {folder}")
 
 
-def metrics_of(found: Identified) -> dict[str, Any]:
+def metrics_of(identified: Identified) -> dict[str, Any]:
     """The content of ``metrics.json``: errors of every sensor, weights, noise, initial states; unknown is null."""
-    estimate, uncertainty = found.estimate, found.estimate.uncertainty
+    estimate, uncertainty = identified.estimate, identified.estimate.uncertainty
     sensors, states = estimate.likelihood.sensors, estimate.likelihood.plant.states
     names, units = [sensor.name for sensor in sensors], [sensor.measurement.unit for sensor in sensors]
     summary: dict[str, Any] = {"iterations": estimate.iterations, "segment": estimate.segment}
     for side in ("training", "held_out"):
-        before, after = (judged.rms.tolist() for judged in getattr(found, side))
-        each = zip(names, units, before, after, strict=True)
-        summary[side] = {"rms": {name: {"unit": unit, "before": b, "after": a} for name, unit, b, a in each}}
-    summary["autocorrelation"] = dict(zip(names, found.autocorrelation.tolist(), strict=True))
+        before, after = (judged.rms.tolist() for judged in getattr(identified, side))
+        rows = zip(names, units, before, after, strict=True)
+        summary[side] = {"rms": {name: {"unit": unit, "before": b, "after": a} for name, unit, b, a in rows}}
+    summary["autocorrelation"] = dict(zip(names, identified.autocorrelation.tolist(), strict=True))
     summary["noise"], summary["bias"] = estimate.noise, estimate.biases
     errors, intervals = uncertainty.standard_errors(), uncertainty.intervals()
     summary["weights"] = {
@@ -182,11 +182,11 @@ def held_back(plant: rt.Plant, segments: list[rt.Trajectory]) -> dict[str, float
     In these intervals the action that the actuators allow drives the twin. They are a sign of wrong rate limits, units
     or columns.
     """
-    found = []
+    held = []
     for segment in segments:
         allowed = plant.actuate(segment.states[:-1], segment.actions)
-        found.append((allowed - segment.actions).abs() > 1e-6 * segment.actions.abs().amax(0).clamp_min(1e-12))
-    return dict(zip((a.name for a in plant.actions), torch.cat(found).double().mean(0).tolist(), strict=True))
+        held.append((allowed - segment.actions).abs() > 1e-6 * segment.actions.abs().amax(0).clamp_min(1e-12))
+    return dict(zip((a.name for a in plant.actions), torch.cat(held).double().mean(0).tolist(), strict=True))
 
 
 def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) -> str:
@@ -212,18 +212,18 @@ def table(metrics: dict[str, Any]) -> str:
         for side in ("training", "held_out")
         for name, rms in metrics[side]["rms"].items()
     }
-    told = {key: metrics[key] for key in ("noise", "bias")} | {"neighbours' correlation": metrics["autocorrelation"]}
+    errors = {key: metrics[key] for key in ("noise", "bias")} | {"neighbours' correlation": metrics["autocorrelation"]}
     weights = {name: {key: entry[key] for key in SHOWN} for name, entry in metrics["weights"].items()}
     frame = pandas().DataFrame
-    blocks = [frame(of_sensors).T, frame(told), frame(weights).T]
-    shown = [block.astype(float).to_string(float_format="{:.5g}".format, na_rep="unknown") for block in blocks]
+    blocks = [frame(of_sensors).T, frame(errors), frame(weights).T]
+    texts = [block.astype(float).to_string(float_format="{:.5g}".format, na_rep="unknown") for block in blocks]
     notes = [f"note: {warning}" for warning in metrics["warnings"]]
     notes += [
         f"the plant's actuators hold back {name} in {share:.1%} of the log"
         for name, share in metrics["held_back"].items()
         if share
     ]
-    return "\n\n".join([*shown, "\n".join(notes)])
+    return "\n\n".join([*texts, "\n".join(notes)])
 
 
 if __name__ == "__main__":

@@ -200,9 +200,9 @@ class DDPG:
 def main(config: Config) -> None:
     recipe = load_recipe(Path(__file__).with_name(f"{config.plant}.py"))
     words = ["--preset", "paper", "--seed", str(config.seed), "--episodes", str(config.episodes)]
-    for i, found in enumerate(twinning(from_command_line(recipe.Config, words))):
-        numbers = (f"{name} {value:.4g}" for name, value in found.items() if not isinstance(value, str))
-        print(f"episode {i + 1}: {', '.join(numbers)}, {found['event']}", flush=True)
+    for i, episode in enumerate(twinning(from_command_line(recipe.Config, words))):
+        numbers = (f"{name} {value:.4g}" for name, value in episode.items() if not isinstance(value, str))
+        print(f"episode {i + 1}: {', '.join(numbers)}, {episode['event']}", flush=True)
 
 
 if __name__ == "__main__":

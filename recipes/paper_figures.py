@@ -72,11 +72,11 @@ def band(ax: Axes, curves: np.ndarray, colour: str, label: str) -> None:
 
 def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
     """Figures 10 and 11: costs over the mean initial cost of the seeds, and which policy was live."""
-    start = np.mean([one["summary"]["unseen"]["J_a_before"]["mean"] for one in metrics])
-    start_of_twin = np.mean([one["episodes"][0]["J_p_before"] for one in metrics])
+    start = np.mean([run["summary"]["unseen"]["J_a_before"]["mean"] for run in metrics])
+    start_of_twin = np.mean([run["episodes"][0]["J_p_before"] for run in metrics])
 
     def curves(key: str, start: float = start) -> np.ndarray:
-        return np.array([[episode[key] for episode in one["episodes"]] for one in metrics]) / start
+        return np.array([[episode[key] for episode in run["episodes"]] for run in metrics]) / start
 
     figure, axes = panels(3, title=f"{plant}: learning, {len(metrics)} seeds", size=(7.5, 9.0), sharex=True)
     control, assimilation, live = axes.flat
@@ -87,14 +87,14 @@ def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
         control.axhline(mean, color=ROLES[role], linewidth=0.8, label=f"{role_name(role)} at the end, paper")
     band(assimilation, curves("J_p", start_of_twin), TWIN, "twin")
     assimilation.axhline(RATIOS[plant]["J_p"][0], color=TWIN, linewidth=0.8, label="at the end, paper")
-    for row, one in enumerate(metrics):
+    for row, run in enumerate(metrics):
         for role in POLICIES:
-            spans = [(k + 0.5, 1.0) for k, episode in enumerate(one["episodes"]) if episode["live"] == role]
+            spans = [(k + 0.5, 1.0) for k, episode in enumerate(run["episodes"]) if episode["live"] == role]
             live.broken_barh(spans, (row - 0.4, 0.8), facecolors=ROLES[role])
     live.axvline(SWITCHES[plant] + 0.5, color="0.2", linestyle=":", label="first change of roles, paper")
     live.set_xlabel("episode")
     live.xaxis.set_major_locator(MaxNLocator(integer=True))
-    live.set_yticks(range(len(metrics)), [f"seed {one['seed']}" for one in metrics])
+    live.set_yticks(range(len(metrics)), [f"seed {run['seed']}" for run in metrics])
     for ax, label in ((control, "J_a over its mean at the start"), (assimilation, "J_p over its mean at the start")):
         ax.set_yscale("log")
         caption(ax, label)
@@ -105,16 +105,16 @@ def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
 
 def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
     """Figures 15, 19 and 25: costs of both policies and of the twin on unseen episodes, of all seeds."""
-    unseen = [one["summary"]["unseen"] for one in metrics]
+    unseen = [run["summary"]["unseen"] for run in metrics]
     figure, axes = panels(1, 2, title=f"{plant}: unseen episodes of {len(unseen)} seeds", size=(9.0, 4.5))
-    violins = {role_name(role): [c for one in unseen for c in one["costs"][role] if c is not None] for role in POLICIES}
-    for ax, found, label in (
+    violins = {role_name(role): [c for run in unseen for c in run["costs"][role] if c is not None] for role in POLICIES}
+    for ax, costs, label in (
         (axes[0, 0], violins, "J_a on the real system"),
-        (axes[0, 1], {"twin": [c for one in unseen for c in one["J_p_each"] if c is not None]}, "J_p"),
+        (axes[0, 1], {"twin": [c for run in unseen for c in run["J_p_each"] if c is not None]}, "J_p"),
     ):
-        values = [np.log10(np.maximum(one, 1e-300)) for one in found.values()]
+        values = [np.log10(np.maximum(sample, 1e-300)) for sample in costs.values()]
         ax.violinplot(values, showmedians=True)
-        ax.set_xticks(range(1, len(found) + 1), list(found))
+        ax.set_xticks(range(1, len(costs) + 1), list(costs))
         caption(ax, f"log10 of {label}")
     return figure
 
@@ -122,9 +122,9 @@ def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
 @torch.no_grad()
 def prediction(run: rt.LoadedRun) -> Figure:
     """Figures 12b, 16b and 22 d to f: states of the twin against real ones, in unseen episodes of the live policy."""
-    believed, flown = run.twin.believed, [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
-    again = [believed.replay(one.states[None, 0], one.exogenous[None], one.actions[None]).states[0] for one in flown]
-    real, twin = (array(torch.cat(states)) for states in ([one.states for one in flown], again))
+    replay, flown = run.twin.believed.replay, [run.simulate(run.policy(run.live), seed=k) for k in range(EPISODES)]
+    twins = [replay(flight.states[None, 0], flight.exogenous[None], flight.actions[None]).states[0] for flight in flown]
+    real, twin = (array(torch.cat(states)) for states in ([flight.states for flight in flown], twins))
     names = {name.split(" ")[0] for name in run.metrics["summary"]["twin"]["rms"]}
     compared = [k for k, state in enumerate(run.plant.states) if state.name in names]
     title, size = f"{run.plant.name}: twin and reality", (4.2 * len(compared), 4.5)
@@ -144,9 +144,9 @@ def power_over_wind(run: rt.LoadedRun) -> Figure:
     """Figure 14b: the power coefficient at the wind speeds of unseen episodes, and its greatest mean."""
     figure, ((ax,),) = panels(1, title="Power coefficient where the turbine operates", size=(6.5, 4.5))
     flown = [run.simulate(run.policy(run.live), seed=seed) for seed in range(EPISODES)]
-    u = torch.cat([one.exogenous[:, 0] for one in flown])
-    ratio = torch.cat([one.states[:-1, 0] for one in flown]) * run.plant.radius / u
-    pitch = torch.cat([one.actions[:, 1] for one in flown])
+    u = torch.cat([flight.exogenous[:, 0] for flight in flown])
+    ratio = torch.cat([flight.states[:-1, 0] for flight in flown]) * run.plant.radius / u
+    pitch = torch.cat([flight.actions[:, 1] for flight in flown])
     C_p, bins = array(run.plant.closure(torch.stack([ratio, pitch], -1)).squeeze(-1)), np.floor(array(u))
     ax.plot(array(u), C_p, ".", markersize=2, color=ROLES["model_based"], alpha=0.4)
     greatest = max(C_p[bins == low].mean() for low in np.unique(bins) if (bins == low).mean() > 0.01)
@@ -165,13 +165,13 @@ def venting(run: rt.LoadedRun) -> Figure:
     vented = array(run.plant.vented_mass(flown.states, flown.actions, law)[:-1])
     hours, pressure = run.plant.dt / 3600.0 * np.arange(len(flow)), 1e-3 * array(flown.states[:-1, 2])
     arrived = hours[np.argmax(1e3 * pressure <= 1.005 * run.plant.set_point)]
-    shown = (
+    curves = (
         (hours, pressure, "pressure [kPa]", f"within 0.5 % after {arrived:.0f} h, paper {HOURS:g}"),
         (hours, vented, "vented mass [kg]", f"{np.interp(HOURS, hours, vented):.0f} in {HOURS:g} h, paper 87"),
         (pressure, flow, "vent flow [g/s]", f"greatest {flow.max():.2g}, paper 0.63"),
     )
     figure, axes = panels(1, 3, title="Tank vented from 5.4 bar", size=(12.0, 4.0))
-    for ax, (x, y, label, note) in zip(axes.flat, shown, strict=True):
+    for ax, (x, y, label, note) in zip(axes.flat, curves, strict=True):
         ax.plot(x, y, ".", markersize=2, color=ROLES[run.live])
         ax.set_xlabel("time [h]" if x is hours else "pressure [kPa]")
         caption(ax, label, note)
@@ -187,13 +187,13 @@ def table(plant: str, metrics: list[dict[str, Any]]) -> str:
     lines = [f"{plant}, {len(metrics)} seeds: cost on unseen episodes after the training over the cost before"]
     keys = {"J_p": "J_p_ratio", **{role: f"J_a_ratio_{role}" for role in POLICIES}}
     for name, key in keys.items():
-        found, (mean, deviation) = np.array([one["summary"][key] for one in metrics]), RATIOS[plant][name]
-        own = f"{found.mean():.3g} ± {found.std(ddof=1):.3g}, median {np.median(found):.3g}"
-        lines.append(f"  {name}: {own} (paper {mean:g} ± {deviation:g})")
-    first = [next((k + 1 for k, e in enumerate(one["episodes"]) if e["event"] == "swap"), None) for one in metrics]
+        ratios, (mean, deviation) = np.array([run["summary"][key] for run in metrics]), RATIOS[plant][name]
+        text = f"{ratios.mean():.3g} ± {ratios.std(ddof=1):.3g}, median {np.median(ratios):.3g}"
+        lines.append(f"  {name}: {text} (paper {mean:g} ± {deviation:g})")
+    first = [next((k + 1 for k, e in enumerate(run["episodes"]) if e["event"] == "swap"), None) for run in metrics]
     lines.append(f"  first change of roles after episode: {', '.join(map(str, first))} (paper {SWITCHES[plant]})")
-    back = [one["seed"] for one in metrics if one["summary"]["live"] == "model_free"]
-    lines.append(f"  the model-free policy is live at the end with seeds: {', '.join(map(str, back)) or 'none'}")
+    seeds = [run["seed"] for run in metrics if run["summary"]["live"] == "model_free"]
+    lines.append(f"  the model-free policy is live at the end with seeds: {', '.join(map(str, seeds)) or 'none'}")
     return "\n".join(lines)
 
 
@@ -206,7 +206,7 @@ def main(config: Config) -> None:
     if failures := run_all(trainings, jobs=config.jobs):
         raise ValueError("\n".join(failures))
     metrics = [read_metrics(training.folder) | {"seed": training.seed} for training in trainings]
-    costs = [one["summary"]["unseen"][f"J_a_{one['summary']['live']}"]["mean"] for one in metrics]
+    costs = [result["summary"]["unseen"][f"J_a_{result['summary']['live']}"]["mean"] for result in metrics]
     run = rt.load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
     drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     drawn["prediction"] = prediction(run)

@@ -79,10 +79,10 @@ class ServedPlant:
     @torch.no_grad()
     def advance(self, command: list[float], answered: float) -> None:
         """Run one interval under the command, or under the safe action."""
-        asked, (low, high) = torch.tensor([command], dtype=torch.float64), bounds(self.plant.actions)
-        valid = answered == self.sample and bool(((asked >= low) & (asked <= high)).all())  # NaN is not
+        action, (low, high) = torch.tensor([command], dtype=torch.float64), bounds(self.plant.actions)
+        valid = answered == self.sample and bool(((action >= low) & (action <= high)).all())  # NaN is not
         t, z = torch.tensor([self._k * self.plant.dt]).double(), self._inputs[:, self._k]
-        step = self.plant.step(t, self._state, asked if valid else self.safe, z, self.plant.closure)
+        step = self.plant.step(t, self._state, action if valid else self.safe, z, self.plant.closure)
         self._state, self._applied = step.state, step.applied
         self.sample, self._k = self.sample + 1, self._k + 1
         if self._k == self.plant.n_steps:
@@ -108,10 +108,10 @@ async def opcua(served: ServedPlant, port: int):
         for tag, value in values.items():
             await nodes[tag].write_value(value)
 
-    async def asked():
+    async def written():
         return [float(await nodes[tag].read_value()) for tag in served.written]
 
-    return server.stop, show, asked
+    return server.stop, show, written
 
 
 async def modbus(served: ServedPlant, port: int):
@@ -129,23 +129,23 @@ async def modbus(served: ServedPlant, port: int):
         words = struct.unpack(f">{4 * len(values)}H", struct.pack(f">{len(values)}d", *values.values()))
         await server.async_setValues(1, 16, 0, list(words))
 
-    async def asked():
+    async def written():
         words = await server.async_getValues(1, 3, WRITTEN_AT, 4 * count)
         return struct.unpack(f">{count}d", struct.pack(f">{4 * count}H", *words))
 
-    return server.shutdown, show, asked
+    return server.shutdown, show, written
 
 
 async def serve(served: ServedPlant, protocol: str, port: int, period: float) -> None:
     """Run a plant at its pace until the task is cancelled."""
-    stop, show, asked = await {"opcua": opcua, "modbus": modbus}[protocol](served, port)
+    stop, show, written = await {"opcua": opcua, "modbus": modbus}[protocol](served, port)
     try:
         await show(served.published())
         due = time.monotonic()
         while True:
             due = max(due + period, time.monotonic())
             await asyncio.sleep(due - time.monotonic())
-            *command, answered = await asked()
+            *command, answered = await written()
             served.advance(command, answered)
             await show(served.published())
     finally:

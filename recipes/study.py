@@ -36,9 +36,9 @@ from rt_torchrl.steps.config import Arm
 
 PLANTS = ("wind_turbine", "flapping_wing", "cryogenic_tank")
 ARMS: tuple[Arm, ...] = ("twinning", "model_based", "model_free")
-OWN = ("--seed", "--log-dir", "--resume", "--threads", "--unseen-every", "--config")
+RESERVED = ("--seed", "--log-dir", "--resume", "--threads", "--unseen-every", "--config")
 """Options that the study gives every run itself."""
-EVERY = ("--threads", "1", "--unseen-every", "1", "--no-figures")
+COMMON = ("--threads", "1", "--unseen-every", "1", "--no-figures")
 QUICK_EFFORT = {"starts": 1, "approach": 100, "iterations": 20, "polish": 5}
 """Effort of the search for the optimum with ``quick``."""
 
@@ -115,14 +115,14 @@ class Config:
         for system, (recipe, of_system) in self.systems_by_name().items():
             for arm, of_arm in arms.items():
                 words = (*of_system, *given, *of_arm)
-                if own := [word for word in words if word.split("=")[0].replace("_", "-") in OWN]:
-                    raise ValueError(f"{', '.join(own)}: the study gives these to each training itself; leave it out.")
+                if reserved := ", ".join(word for word in words if word.split("=")[0].replace("_", "-") in RESERVED):
+                    raise ValueError(f"{reserved}: the study gives these to each training itself; leave it out.")
                 folder = self.log_dir / system / arm
                 trainings[system, arm] = [
                     Training(recipe, words, seed, folder / f"seed-{seed}")
                     for seed in range(min(self.seeds, 2) if self.quick else self.seeds)
                 ]
-                trainings[system, arm][0].asked()  # a mistake ends it here and not in every training
+                trainings[system, arm][0].config()  # a mistake ends it here and not in every training
         return trainings
 
     def search(self, training: "Training") -> "Search":
@@ -168,9 +168,9 @@ class Training:
     seed: int
     folder: Path
 
-    def asked(self) -> rt.RunConfig:
+    def config(self) -> rt.RunConfig:
         """The options of the run."""
-        return dataclasses.replace(options_of(self.recipe, (*EVERY, *self.words)), seed=self.seed, log_dir=self.folder)
+        return dataclasses.replace(options_of(self.recipe, (*COMMON, *self.words)), seed=self.seed, log_dir=self.folder)
 
     def finished(self) -> bool:
         """Whether all episodes are done.
@@ -180,31 +180,31 @@ class Training:
         """
         if not (self.folder / FILE).is_file():
             return False
-        asked = self.asked()
-        found = differences(self.folder, asked, HARMLESS - {"unseen_every"})
-        recipe, mine = read_settings(self.folder).get("recipe"), settings_of(asked, "")["recipe"]["file"]
-        if recipe and recipe.get("file") != mine:
-            found.append(f"the recipe is {mine} here and was {recipe.get('file')} in the run")
+        config = self.config()
+        mismatches = differences(self.folder, config, HARMLESS - {"unseen_every"})
+        recipe, file = read_settings(self.folder).get("recipe"), settings_of(config, "")["recipe"]["file"]
+        if recipe and recipe.get("file") != file:
+            mismatches.append(f"the recipe is {file} here and was {recipe.get('file')} in the run")
         metrics = known(self.folder / "metrics.json")
-        done, wanted = len((metrics or {}).get("episodes", [])), asked.effective().episodes
-        if done > wanted:
-            found.append(f"episodes is {wanted} here and was {done} in the run")
-        if found:
+        done, episodes = len((metrics or {}).get("episodes", [])), config.effective().episodes
+        if done > episodes:
+            mismatches.append(f"episodes is {episodes} here and was {done} in the run")
+        if mismatches:
             raise ValueError(
-                f"{self.folder} holds a run of other options: {'; '.join(found)}. Give its options or another log_dir, "
-                "or remove the folder."
+                f"{self.folder} holds a run of other options: {'; '.join(mismatches)}. Give its options or another "
+                "log_dir, or remove the folder."
             )
-        return metrics is not None and (done == wanted or metrics["summary"].get("ended") is not None)
+        return metrics is not None and (done == episodes or metrics["summary"].get("ended") is not None)
 
     def run(self) -> None:
         """Train, or go on with what is there. ``training.log`` in the folder takes all output, and a traceback."""
         if self.finished():
             return
-        config = dataclasses.replace(self.asked(), resume=(self.folder / FILE).is_file())
+        config = dataclasses.replace(self.config(), resume=(self.folder / FILE).is_file())
         self.folder.mkdir(parents=True, exist_ok=True)
         log = (self.folder / "training.log").open("a", encoding="utf-8")
         with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
-            print(shlex.join([str(self.recipe), *EVERY, *self.words, "--seed", str(self.seed)]), flush=True)
+            print(shlex.join([str(self.recipe), *COMMON, *self.words, "--seed", str(self.seed)]), flush=True)
             try:
                 load_recipe(self.recipe).main(config)
             except Exception:
@@ -271,9 +271,9 @@ class Search:
         episodes = UnseenEpisodes(plant, config.unseen)
         episodes.physics, episodes.closure = physics, worn_closure(config, plant, config.episodes)
         best = exact_optimum(episodes, functools.partial(config.make_policy, physics), **self.effort)
-        found = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
+        optimum = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         self.place.mkdir(parents=True, exist_ok=True)
-        write_json(self.path, {"of": self.of(), **found})
+        write_json(self.path, {"of": self.of(), **optimum})
 
 
 def known(path: Path) -> dict[str, Any] | None:
@@ -360,11 +360,11 @@ def register_ray() -> None:
 def overview(comparisons: Sequence[rt.Comparison], key: str) -> str:
     """Ratios of every arm to the first one by system, and their geometric mean over the systems, as Markdown."""
     first = comparisons[0].rows[0].name
-    numbers = {one.title: one.numbers()["rows"] for one in comparisons if one.rows[0].name == first}
+    numbers = {table.title: table.numbers()["rows"] for table in comparisons if table.rows[0].name == first}
     arms = list(dict.fromkeys(arm for rows in numbers.values() for arm in rows))[1:]
     lines = [[system, *(with_interval(rows.get(arm, {}).get(key)) for arm in arms)] for system, rows in numbers.items()]
     ratios = [[rows[arm][key]["ratio"] for rows in numbers.values() if rows.get(arm, {}).get(key)] for arm in arms]
-    means = [f"{statistics.geometric_mean(each):.3f} ({len(each)})" if each else "" for each in ratios]
+    means = [f"{statistics.geometric_mean(of_arm):.3f} ({len(of_arm)})" if of_arm else "" for of_arm in ratios]
     return markdown(["", *arms], [*lines, ["geometric mean (systems)", *means]])
 
 
@@ -397,7 +397,7 @@ def studied(config: Config) -> tuple[list[rt.Comparison], list[str]]:
     for key, group in trainings.items() if config.optimum else ():
         places = {FinishedRun.read(training.folder).place for training in group if training.finished()}
         # Of a real system that nobody simulates, no gradients are known.
-        if places == {"simulation"} and isinstance(group[0].asked(), MakesPlant):
+        if places == {"simulation"} and isinstance(group[0].config(), MakesPlant):
             searches[key] = config.search(group[0])
     failures += run_all(list({search.path: search for search in searches.values()}.values()), **pool)
     return comparisons_of(trainings, searches), failures
@@ -418,10 +418,10 @@ def comparisons_of(
     least: dict[Path, float] = {}
     for key, search in searches.items():
         if finished[key] and (kept := search.kept()):
-            path, asked = search.path, trainings[key][0].asked()
+            path, config = search.path, trainings[key][0].config()
             sought = math.inf if kept["J_a"] is None else kept["J_a"]
             # Model predictive control in the place of the model-based policy is of another class.
-            plans = asked.twinning.planner.method == "receding_horizon"
+            plans = config.twinning.planner.method == "receding_horizon"
             of_class = (run.cost for run in finished[key] if run.live == "model_free" or not plans)
             least[path] = min([least.get(path, sought), *of_class])
     rows: dict[str, list[Row]] = {}

@@ -28,10 +28,10 @@ class Interruption:
     The attribute ``at_once`` tells whether there was a second signal.
     """
 
-    _asked = False
+    _pending = False
 
     def __enter__(self) -> "Interruption":
-        Interruption._asked = self.at_once = False
+        Interruption._pending = self.at_once = False
         main = threading.current_thread() is threading.main_thread()
         self._before = {number: signal.getsignal(number) for number in SIGNALS if main}
         for number, handler in self._before.items():
@@ -40,16 +40,16 @@ class Interruption:
         return self
 
     def __exit__(self, *error: object) -> None:
-        Interruption._asked = False
+        Interruption._pending = False
         for number, handler in self._before.items():
             if handler in UNTOUCHED:
                 signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if Interruption._asked:
+        if Interruption._pending:
             self.at_once = True
             signal.default_int_handler(number, frame)
-        Interruption._asked = True
+        Interruption._pending = True
         # print() must not be called here: it may be what was interrupted.
         os.write(2, NOTICE)
 
@@ -74,7 +74,7 @@ def safe_point() -> None:
     Raises:
         KeyboardInterrupt: if Ctrl-C or SIGTERM came since the :class:`Interruption` was entered.
     """
-    if Interruption._asked:
+    if Interruption._pending:
         raise KeyboardInterrupt
 
 

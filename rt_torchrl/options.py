@@ -86,8 +86,8 @@ def configuration(options: type[Options]) -> type[Options]:
         base = next((base for base in options.__mro__[1:] if name in inspect.get_annotations(base)), None)
         if base is not None and typing.get_type_hints(base)[name] == declared:  # which are without what is allowed
             options.__annotations__[name] = inspect.get_annotations(base)[name]
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)(options)
-    validated = made.__init__
+    model: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)(options)
+    validated = model.__init__
 
     @functools.wraps(validated)
     def init(self: Any, /, *args: Any, **given: Any) -> None:
@@ -96,8 +96,8 @@ def configuration(options: type[Options]) -> type[Options]:
         except ValidationError as error:
             raise ValueError(in_words(error, type(self))) from None
 
-    made.__init__ = init
-    return made
+    model.__init__ = init
+    return model
 
 
 def read_options(options: type[Options], values: dict[str, Any]) -> Options:
@@ -130,10 +130,10 @@ def _sentence(entry: Any, options: type) -> str:
         return f"{options.__name__} has no option {name}; it is of another version or recipe."
     if kind == "missing":
         return f"{name} is missing."
-    shown = f"{name}={entry['input']!r}"
+    setting = f"{name}={entry['input']!r}"
     if kind == "literal_error":
-        return f"{shown} does not exist; choose {context['expected'].replace(chr(39), '')}."
-    return f"{shown} must {MUST[kind].format(**context)}." if kind in MUST else f"{shown}: {entry['msg']}."
+        return f"{setting} does not exist; choose {context['expected'].replace(chr(39), '')}."
+    return f"{setting} must {MUST[kind].format(**context)}." if kind in MUST else f"{setting}: {entry['msg']}."
 
 
 def require_checked(options: type) -> None:
@@ -236,10 +236,10 @@ def array_of(name: str, values: Any) -> np.ndarray:
         ValueError: if they are no numbers, or the rows differ in length.
     """
     try:
-        found = np.asarray(values)
-        if found.dtype.kind not in "fiu" and found.size:
-            raise ValueError(f"its entries are of type {found.dtype}")
-        return found.astype(np.float64)
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiu" and array.size:
+            raise ValueError(f"its entries are of type {array.dtype}")
+        return array.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} must be an array of numbers: {error}.") from error
 

@@ -211,8 +211,8 @@ def test_systems_and_arms_have_names(tmp_path):
     (training, *others) = made.trainings()["gusty", "model_free"]
     assert training.words == ("--horizon=2", "--unseen", "4", "--twinning.arm", "model_free") and len(others) == 4
     assert training.folder == tmp_path / "gusty" / "model_free" / "seed-0"
-    asked = training.asked()
-    assert (asked.horizon, asked.unseen, asked.twinning.arm, asked.unseen_every) == (2.0, 4, "model_free", 1)
+    config = training.config()
+    assert (config.horizon, config.unseen, config.twinning.arm, config.unseen_every) == (2.0, 4, "model_free", 1)
     small = study.Config(quick=True)
     assert {key: len(group) for key, group in small.trainings().items()} == {
         ("wind_turbine", arm): 2 for arm in ("twinning", "model_based", "model_free")
@@ -334,9 +334,9 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         metrics = json.loads((folder / "metrics.json").read_text())
         metrics["summary"]["live"], metrics["summary"]["unseen"]["costs"][live] = live, [cost, cost]
         (folder / "metrics.json").write_text(json.dumps(metrics))
-        asked = study.options_of(TINY, words)
+        config = study.options_of(TINY, words)
         trainings["tiny", arm] = [
-            SimpleNamespace(folder=folder, finished=lambda: True, asked=lambda asked=asked: asked)
+            SimpleNamespace(folder=folder, finished=lambda: True, config=lambda config=config: config)
         ]
         searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
     (found,) = study.comparisons_of(trainings, searches)

@@ -177,10 +177,10 @@ def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
 
 def _coefficients(snapshot: Snapshot) -> list[str]:
     """A line for each law that names its coefficients."""
-    found = {name: getattr(law, "named_coefficients", None) for name, law in style.closures(snapshot).items()}
+    coefficients = {name: getattr(law, "named_coefficients", None) for name, law in style.closures(snapshot).items()}
     return [
         f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in named().items())
-        for name, named in found.items()
+        for name, named in coefficients.items()
         if named is not None
     ]
 

@@ -100,13 +100,13 @@ class Answer:
         start: state at the start of the episode, from which filters and actuators begin.
         wind: wind speeds of all control intervals [m/s].
         decide: function that returns the action (torque [N m], pitch [deg]) for a state, the wind of the interval to
-            come, and the simulator's report. It is called every ``every`` steps; in between the action is held.
-        every: number of steps of the simulator between two decisions.
+            come, and the simulator's report. It is called every ``interval`` steps; in between the action is held.
+        interval: number of steps of the simulator between two decisions.
     """
 
-    def __init__(self, plant: Plant, start: Tensor, wind: np.ndarray, decide: Decide, every: int):
+    def __init__(self, plant: Plant, start: Tensor, wind: np.ndarray, decide: Decide, interval: int):
         self.plant, self.turbine, self.state, self._wind = plant, turbine_of(plant), start.clone(), wind
-        self._decide, self._every, self._step = decide, every, 0
+        self._decide, self._interval, self._step = decide, interval, 0
         computed = ("generator_torque", "blade_pitch", "rotor_speed")
         self._filters = [k for k, signal in enumerate(plant.states) if signal.name not in computed]
 
@@ -117,8 +117,8 @@ class Answer:
             self.state[0] = speed
         else:
             self._follow(speed, float(report["ws"]))
-        if self._step % self._every == 0:
-            k = min(self._step // self._every, len(self._wind) - 1)
+        if self._step % self._interval == 0:
+            k = min(self._step // self._interval, len(self._wind) - 1)
             action = self._decide(self.state, float(self._wind[k]), report)
             self.state = self.plant.latch(self.state, action)
         self._step += 1
@@ -202,7 +202,7 @@ def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "
             observes a preview of the wind.
     """
     turbine_of(plant)
-    every = steps_of(plant)
+    interval = steps_of(plant)
     if plant.previews:
         names = ", ".join(signal.name for signal in plant.inputs[len(plant.acting_inputs) :])
         raise ValueError(f"ROSCO's simulator has no lidar, but the plant observes {names}; observe measured+wind.")
@@ -214,7 +214,7 @@ def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "
             command = controller({"state": state.numpy(), "wind": [wind]})
             return machine.actuate(state, torch.from_numpy(command))
 
-        simulate(machine, seed, lambda start, wind: Answer(machine, start, wind, decide, every))
+        simulate(machine, seed, lambda start, wind: Answer(machine, start, wind, decide, interval))
 
     env = CallingSimulator(run, {"state": len(plant.states), "wind": 1}, plant.actions)
     wind = Reading(keys=("wind",))
@@ -240,7 +240,7 @@ class RoscoController(RealController):
     def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """States, applied actions and wind at every control interval."""
         plant = copy.deepcopy(self.plant).cpu()
-        every = steps_of(plant)
+        interval = steps_of(plant)
         states, applied, winds = [], [], []
         with tempfile.TemporaryDirectory() as folder:
             interface = controller_interface(Path(folder))
@@ -253,10 +253,10 @@ class RoscoController(RealController):
                 return applied[-1]
 
             with silenced():
-                simulate(plant, seed, lambda start, wind: Answer(plant, start, wind.repeat(every), decide, 1))
+                simulate(plant, seed, lambda start, wind: Answer(plant, start, wind.repeat(interval), decide, 1))
                 unload(interface)
-        wind = torch.tensor(winds[::every][:-1], dtype=torch.float64)
-        return torch.stack(states[::every]), torch.stack(applied[::every])[:-1], wind
+        wind = torch.tensor(winds[::interval][:-1], dtype=torch.float64)
+        return torch.stack(states[::interval]), torch.stack(applied[::interval])[:-1], wind
 
 
 def controller_interface(folder: Path, **tuning: float) -> Any:

@@ -67,8 +67,8 @@ class LaggedInflow(Extension):
             super().__init__(base, [Signal(symbol=r"\tau", name="lagged_torque", unit="N m")])
         else:
             meanings = {"force_lag": "time constant of the rotor's power"}
-            own = PositiveCoefficients([time_constant], names={"force_lag": "s"}, meanings=meanings, factor=FACTOR)
-            super().__init__(base, [Signal(symbol="P", name="lagged_power", unit="MW")], own.requires_grad_(False))
+            closure = PositiveCoefficients([time_constant], names={"force_lag": "s"}, meanings=meanings, factor=FACTOR)
+            super().__init__(base, [Signal(symbol="P", name="lagged_power", unit="MW")], closure.requires_grad_(False))
         self.of, self.time_constant = of, time_constant
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
@@ -190,11 +190,11 @@ class SwayingTower(Blown):
         return 0.5 * turbine.air_density * math.pi * turbine.radius**2 * wind.square() * coefficient
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
-        (base, hidden), met = self.split(state), exogenous[..., 0] - state[..., -1]
+        (base, hidden), wind = self.split(state), exogenous[..., 0] - state[..., -1]
         x, v = hidden.unbind(-1)
-        field = self.base.vector_field(t, base, action, replaced(exogenous, 0, met), closure)
+        field = self.base.vector_field(t, base, action, replaced(exogenous, 0, wind), closure)
         spring = self.frequency**2 * x + 2.0 * self.damping * self.frequency * v
-        return torch.cat([field, torch.stack([v, self.thrust(met, action[..., 1]) / self.mass - spring], -1)], -1)
+        return torch.cat([field, torch.stack([v, self.thrust(wind, action[..., 1]) / self.mass - spring], -1)], -1)
 
     def rest(self, base: State) -> Hidden:
         """The tower stands as the wind bends it on average, without motion."""

@@ -73,14 +73,14 @@ def grid(
         xlabel: label of the abscissa.
         layout: further arguments of ``Figure.subplots``.
     """
-    figure, axes = panels(-(-count // columns), columns, title=title, size=size, sharex=True, **layout)
-    shown = axes.flat[:count].tolist()
-    for ax in axes.flat[count:]:
+    figure, subplots = panels(-(-count // columns), columns, title=title, size=size, sharex=True, **layout)
+    axes = subplots.flat[:count].tolist()
+    for ax in subplots.flat[count:]:
         ax.remove()
-    for ax in shown[max(0, count - columns) :]:
+    for ax in axes[max(0, count - columns) :]:
         ax.set_xlabel(xlabel)
         ax.tick_params(labelbottom=True)
-    return figure, shown
+    return figure, axes
 
 
 def timeline(

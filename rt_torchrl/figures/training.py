@@ -125,12 +125,12 @@ def learning_curves(snapshot: Snapshot) -> Figure:
     idle. A panel is left out if the arm does not report its values.
     """
     episodes = snapshot.episodes
-    shown = [
+    panels = [
         (name, curves)
         for name, curves in (("control cost $J_a$", CONTROL), ("identification cost $J_p$", IDENTIFICATION))
         if any(np.isfinite(_column(episodes, key)).any() for key in curves)
     ]
-    heights = [2.6] * len(shown) + [0.9]
+    heights = [2.6] * len(panels) + [0.9]
     figure, (*axes, strip) = style.grid(
         len(heights),
         title="Learning curves and live policy",
@@ -138,7 +138,7 @@ def learning_curves(snapshot: Snapshot) -> Figure:
         xlabel="episode",
         height_ratios=heights,
     )
-    for (name, curves), ax in zip(shown, axes, strict=True):
+    for (name, curves), ax in zip(panels, axes, strict=True):
         for key, look in curves.items():
             if np.isfinite(column := _column(episodes, key)).any():
                 ax.plot(np.arange(len(episodes)), column, linewidth=1.4, markersize=4, **look)
@@ -166,15 +166,15 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     size = (0.6 + 3.6 * wide, 1.3 + 2.8 * -(-len(columns) // wide))
     title = "Closure weights of the twin over the episodes"
     figure, axes = style.grid(len(columns), wide, title=title, size=size, xlabel="episode")
-    for ax, (name, found) in zip(axes, columns.items(), strict=True):
-        ax.plot(np.arange(len(found)), found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
+    for ax, (name, values) in zip(axes, columns.items(), strict=True):
+        ax.plot(np.arange(len(values)), values, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if name in start:
             ax.axhline(start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
             ax.axhline(true[name], label="true", **style.REFERENCE_LINE)
         style.logarithmic_if_wide(ax)
         label = _label(name, described.get(name, {}))
-        caption(ax, label, f"{100.0 * (found[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
+        caption(ax, label, f"{100.0 * (values[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
     legend_below(figure, axes)
@@ -194,7 +194,7 @@ def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarra
     There are none in runs that are older than the key ``closure``, nor for a closure whose weights have no names.
     """
     reported = [_numbers(episode.get("closure")) for episode in episodes]
-    return {name: _column(reported, name) for name in dict.fromkeys(name for found in reported for name in found)}
+    return {name: _column(reported, name) for name in dict.fromkeys(name for weights in reported for name in weights)}
 
 
 def _numbers(closure: dict[str, Any] | None) -> dict[str, float]:
@@ -257,12 +257,12 @@ def _curves(snapshot: Snapshot) -> Figure:
         values = array(snapshot.policies[role](axis[:, None]))
         for k, ax in enumerate(axes):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
-    shown = array(_some(seen[:, 0]))
+    visited = array(_some(seen[:, 0]))
     for ax, action in zip(axes, plant.actions, strict=True):
         style.limits(ax, action)
         ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
         rug: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
-        ax.plot(shown, np.full_like(shown, 0.02), "|", label="visited", **rug)
+        ax.plot(visited, np.full_like(visited, 0.02), "|", label="visited", **rug)
         caption(ax, action.label)
     axes[0].set_xlim(axis[0].item(), axis[-1].item())
     legend_below(figure, axes)
@@ -326,8 +326,8 @@ def contours(
             ax.set_xlabel(signals[plane[0]].label)
             ax.xaxis.set_major_locator(MaxNLocator(5))
         pair[0].set_ylabel(signals[plane[1]].label)
-    every = [ax for pair in planes.values() for ax in pair]
-    every[0].figure.colorbar(filled, ax=every, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
+    axes = [ax for pair in planes.values() for ax in pair]
+    axes[0].figure.colorbar(filled, ax=axes, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
 
 
 def functions_of_observation(snapshot: Snapshot) -> list[Role]:

@@ -9,18 +9,18 @@ from rt_torchrl.fit.least_squares import Identified
 from rt_torchrl.fit.uncertainty import Uncertainty
 
 
-def twin_and_sensors(found: Identified) -> Figure:
+def twin_and_sensors(identified: Identified) -> Figure:
     """What every sensor has read over time, and what the twin says it reads, after the estimation; held out is shaded.
 
     The notes give the root mean square errors on the held-out records.
     """
-    sensors, dt = found.estimate.likelihood.sensors, found.estimate.likelihood.plant.dt
-    training, held_out = found.training[1].records, found.held_out[1].records
+    sensors, dt = identified.estimate.likelihood.sensors, identified.estimate.likelihood.plant.dt
+    training, held_out = identified.training[1].records, identified.held_out[1].records
     begin, last = training[0].start, held_out[-1].start
     unit, length = style.time_unit(last + dt * len(held_out[-1].actions) - begin)
     size = (9.0, 1.2 + 2.2 * len(sensors))
     figure, axes = style.grid(len(sensors), title="Twin and sensors", size=size, xlabel=f"time [{unit}]")
-    parts = ((training, found.training[1]), (held_out, found.held_out[1]))
+    parts = ((training, identified.training[1]), (held_out, identified.held_out[1]))
     for k, (ax, sensor) in enumerate(zip(axes, sensors, strict=True)):
         read = np.concatenate([array(record.readings[:, k]) for record in (*training, *held_out)])
         margin = 0.1 * (np.nanmax(read) - np.nanmin(read)) or 1.0
@@ -34,7 +34,7 @@ def twin_and_sensors(found: Identified) -> Figure:
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
         # A twin that is far off must not flatten what was read.
         ax.set_ylim(np.nanmin(read) - margin, np.nanmax(read) + margin)
-        before, after = (style.with_unit(one.rms[k].item(), sensor.measurement.unit) for one in found.held_out)
+        before, after = (style.with_unit(fit.rms[k].item(), sensor.measurement.unit) for fit in identified.held_out)
         caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
     legend_below(figure, axes)
     return figure
