@@ -48,10 +48,10 @@ class ClassicalController(nn.Module, ABC):
         super().__init__()
         values = torch.tensor(self.default_gains if gains is None else gains, dtype=torch.float64)
         if len(values) != len(self.gain_units) or not (values.isfinite() & (values > 0)).all():
-            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items()) or "none"
+            units = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items()) or "none"
             given = f"default_gains={self.default_gains}" if gains is None else f"gains={gains}"
             raise ValueError(
-                f"{given} of {type(self).__name__} must be positive and finite: {wanted}, one for each entry of "
+                f"{given} of {type(self).__name__} must be positive and finite: {units}, one for each entry of "
                 "gain_units."
             )
         self.plant = plant

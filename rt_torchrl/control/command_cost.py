@@ -110,9 +110,9 @@ class CommandCost:
 
     def commands(self, plan: Plan) -> Float[Tensor, "n n_a"]:
         """The commands of all n intervals, in their own units."""
-        return torch.from_numpy(self._low + self._span * self._each(plan))
+        return torch.from_numpy(self._low + self._span * self._repeated(plan))
 
-    def _each(self, plan: Plan) -> Float[np.ndarray, "n n_a"]:
+    def _repeated(self, plan: Plan) -> Float[np.ndarray, "n n_a"]:
         return np.repeat(plan, self.hold, 0)[: self.n]
 
     def begin(self, state: Float[Tensor, " n_s"], exogenous: Float[Tensor, "n n_z"], *, start: float = 0.0) -> None:
@@ -122,10 +122,10 @@ class CommandCost:
         self._state = torch.nn.functional.pad(state, (0, 1)).unsqueeze(0)
         self._drive = Drive(t, exogenous.unsqueeze(1), command)
         with torch.enable_grad():
-            found = code_of(self.interval, self._state, self._drive._replace(command=command.clone().requires_grad_()))
+            traced = code_of(self.interval, self._state, self._drive._replace(command=command.clone().requires_grad_()))
         self._code = None
-        if found is not None:  # kept code, unless the plant or the closure is another one by now
-            self._code, inputs = found
+        if traced is not None:  # kept code, unless the plant or the closure is another one by now
+            self._code, inputs = traced
             self._lay_out(self._code, inputs.row())
 
     def _lay_out(self, code: IntervalCode, weights: np.ndarray) -> None:
@@ -145,7 +145,7 @@ class CommandCost:
         if self._code is None:
             return self._by_torch(plan)
         n_a = len(self.plant.actions)
-        self._x[:, 0, -n_a:] = self._each(plan)
+        self._x[:, 0, -n_a:] = self._repeated(plan)
         self._march()
         self._costate[:] = 0.0
         self._costate[-1] = 1.0
@@ -183,15 +183,15 @@ class _Seen:
         self.best, self._scale = Minimum(start, cost, gradient), abs(cost) or 1.0
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        found = self.best
-        if not (flat == found.point.ravel()).all():  # L-BFGS-B begins at the start, whose cost is known
-            point = flat.reshape(found.point.shape)
-            found = Minimum(point.copy(), *self._evaluate(point))
-            if not (np.isfinite(found.cost) and np.isfinite(found.gradient).all()):
+        trial = self.best
+        if not (flat == trial.point.ravel()).all():  # L-BFGS-B begins at the start, whose cost is known
+            point = flat.reshape(trial.point.shape)
+            trial = Minimum(point.copy(), *self._evaluate(point))
+            if not (np.isfinite(trial.cost) and np.isfinite(trial.gradient).all()):
                 return DIVERGED, np.zeros_like(flat)
-            if found.cost < self.best.cost:
-                self.best = found
-        return found.cost / self._scale, found.gradient.ravel() / self._scale
+            if trial.cost < self.best.cost:
+                self.best = trial
+        return trial.cost / self._scale, trial.gradient.ravel() / self._scale
 
 
 def descend(

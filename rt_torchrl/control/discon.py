@@ -94,11 +94,11 @@ class DISCON(ClassicalController):
         rows = torch.cat([state[:, self._read], exogenous[:, self._wind, None]], -1).tolist()
         command = state.new_zeros(len(state), 2)
         for k, (copy, row) in enumerate(zip(self._flying, rows, strict=True)):
-            command[k, self._places] = state.new_tensor(copy.called(self._told(*row)))
+            command[k, self._places] = state.new_tensor(copy.called(self._records(*row)))
         self._intervals += 1
         return command, memory
 
-    def _told(self, rotor_speed: float, torque: float, pitch: float, wind: float) -> dict[Record, float]:
+    def _records(self, rotor_speed: float, torque: float, pitch: float, wind: float) -> dict[Record, float]:
         """The records of the turbine."""
         turbine: Any = self.plant.innermost
         speed, angle = turbine.gear_ratio * rotor_speed, math.radians(pitch)
@@ -148,14 +148,14 @@ def loaded(library: Path) -> ctypes.CDLL:
         ValueError: if it is none.
     """
     try:
-        found = ctypes.CDLL(str(library))
+        dll = ctypes.CDLL(str(library))
     except OSError as error:
         raise ValueError(
             f"library={str(library)!r} of DISCON cannot be loaded here: {error}. Give a shared library for this system."
         ) from error
-    if not hasattr(found, "DISCON"):
+    if not hasattr(dll, "DISCON"):
         raise ValueError(f"library={str(library)!r} has no function DISCON; give a controller in the style of Bladed.")
-    return found
+    return dll
 
 
 class _Copy:

@@ -33,7 +33,7 @@ NOISY = ("torchrl", "torch.utils.cpp_extension")
 """Loggers that report the inner work of a library."""
 
 
-OURS = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
+SOURCES = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
 """Folders of the library, its plants and its recipes, in a checkout as in a wheel."""
 
 
@@ -75,8 +75,8 @@ def _is_for_users(error: Exception) -> bool:
     A ``NotImplementedError`` without words, of a method that a class lacks, tells nobody what to mend.
     """
     *_, last = traceback.extract_tb(error.__traceback__)
-    ours = any(Path(last.filename).resolve().is_relative_to(folder) for folder in OURS)
-    return ours and (last.line or "").startswith("raise ") and str(error) != ""
+    in_sources = any(Path(last.filename).resolve().is_relative_to(folder) for folder in SOURCES)
+    return in_sources and (last.line or "").startswith("raise ") and str(error) != ""
 
 
 HELP_ALL = "--help-all"
@@ -124,8 +124,8 @@ def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bo
     """The defaults of all options beside those that are given, with which help is asked for or not."""
     try:
         config = tyro.cli(config_class, args=words, console_outputs=not helped)
-        begun = None if config.log_dir is None else config.log_dir / FILE
-        resumed = begun if config.resume and begun and begun.is_file() else None
+        settings = None if config.log_dir is None else config.log_dir / FILE
+        resumed = settings if config.resume and settings and settings.is_file() else None
         file = config.config or resumed
         return config.defaults() if file is None else of_file(file, config)
     except (SystemExit, ValueError, OSError):
@@ -134,8 +134,8 @@ def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bo
         raise
 
 
-def of_file(path: Path, asked: RunConfig) -> RunConfig:
-    """The options in a file, such as ``config.json`` of a run; those that it lacks have the defaults of ``asked``.
+def of_file(path: Path, config: RunConfig) -> RunConfig:
+    """The options in a file, such as ``config.json`` of a run; those that it lacks have the defaults of ``config``.
 
     Nothing of the file is imported or run.
 
@@ -143,17 +143,17 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
         ValueError: if the file cannot be read, is that of another recipe, or holds an option that does not exist or a
             value that it does not take.
     """
-    found = read_json(path)
-    recipe: Any = {} if found.get("recipe") is None else found["recipe"]
-    made = recipe.get("file") if isinstance(recipe, dict) else 0
-    if not isinstance(made, str | None):
+    settings = read_json(path)
+    recipe: Any = {} if settings.get("recipe") is None else settings["recipe"]
+    source = recipe.get("file") if isinstance(recipe, dict) else 0
+    if not isinstance(source, str | None):
         raise ValueError(f"{path}: its recipe is {recipe!r}; it must be an object, as in config.json of a run.")
-    mine = getattr(sys.modules[type(asked).__module__], "__file__", None)
-    if made and mine and Path(made).name != Path(mine).name:
-        raise ValueError(f"{path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
-    options = {name: value for name, value in found.items() if name not in (*BESIDE, *OF_THE_CALL)}
+    file = getattr(sys.modules[type(config).__module__], "__file__", None)
+    if source and file and Path(source).name != Path(file).name:
+        raise ValueError(f"{path} is of the recipe {Path(source).name}, not of {Path(file).name}; use its recipe.")
+    options = {name: value for name, value in settings.items() if name not in (*BESIDE, *OF_THE_CALL)}
     try:
-        read = read_options(type(asked), _over(as_written(asked.defaults()), options))
+        read = read_options(type(config), _over(as_written(config.defaults()), options))
         return dataclasses.replace(read, config=None, log_dir=None)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from error
@@ -178,8 +178,8 @@ def load_recipe(path: Path) -> ModuleType:
     if not path.is_file():
         raise ValueError(f"recipe={path} does not exist; give the file of a recipe.")
     module = module_of(path)
-    found = getattr(module, "Config", None)
-    if not (isinstance(found, type) and issubclass(found, RunConfig)):
+    config_class = getattr(module, "Config", None)
+    if not (isinstance(config_class, type) and issubclass(config_class, RunConfig)):
         raise ValueError(f"recipe={path} has no class Config derived from RunConfig.")
     if not callable(getattr(module, "main", None)):
         raise ValueError(f"recipe={path} has no function main that takes its Config.")
@@ -188,13 +188,13 @@ def load_recipe(path: Path) -> ModuleType:
 
 def shipped_plants() -> dict[str, type[Plant]]:
     """The plant class of each folder under ``rt_torchrl.envs``, by the folder's name; ``plant.py`` there holds one."""
-    found = {}
+    plants = {}
     for folder in pkgutil.iter_modules(rt_torchrl.envs.__path__):
         if folder.ispkg:
             module = importlib.import_module(f"rt_torchrl.envs.{folder.name}.plant")
             kinds = [kind for kind in vars(module).values() if inspect.isclass(kind) and issubclass(kind, Plant)]
-            (found[folder.name],) = [kind for kind in kinds if kind.__module__ == module.__name__]
-    return found
+            (plants[folder.name],) = [kind for kind in kinds if kind.__module__ == module.__name__]
+    return plants
 
 
 def plant_class(name: str) -> type[Plant]:
@@ -214,7 +214,7 @@ def plant_class(name: str) -> type[Plant]:
                 "FILE.py:NAME or package.module:NAME."
             )
         return known[name]
-    found = named(name)
-    if not (inspect.isclass(found) and issubclass(found, Plant)):
+    kind = named(name)
+    if not (inspect.isclass(kind) and issubclass(kind, Plant)):
         raise ValueError(f"plant={name!r} is no class derived from Plant.")
-    return found
+    return kind

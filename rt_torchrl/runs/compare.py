@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 NEAR = 0.1
 """Distance from the optimum, as a share of it, within which a policy is near the optimum."""
-APART = {*BESIDE, *BESIDE_TRAINING, "seed"}
+EXCLUDED = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
 COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
 MARKERS = "os^DvP*X"
@@ -98,8 +98,8 @@ class FinishedRun:
             real=_numbers(episode["real_cost"] for episode in episodes),
             merit=_means(unseen["merit"][live]),
             controllers={
-                name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(found["merit"]))
-                for name, found in unseen["baselines"].items()
+                name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(baseline["merit"]))
+                for name, baseline in unseen["baselines"].items()
             },
             alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
             seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),
@@ -209,7 +209,7 @@ class Comparison:
         controllers: dict[str, tuple[float, dict[str, float]]] = {}
         for rows in groups:
             run, task = rows[0].runs[0], f" ({rows[0].name})" if len(groups) > 1 else ""
-            controllers |= {f"{name}{task}": found for name, found in run.controllers.items()}
+            controllers |= {f"{name}{task}": numbers for name, numbers in run.controllers.items()}
         return controllers
 
     def numbers(self) -> dict[str, Any]:
@@ -270,13 +270,13 @@ def compare_runs(folders: Iterable[Path | str]) -> Comparison:
     runs = [FinishedRun.read(Path(folder)) for folder in folders]
     if not runs:
         raise ValueError("folders names no run; give the folders of finished runs.")
-    options = [flat({key: value for key, value in run.settings.items() if key not in APART}) for run in runs]
-    keys = dict.fromkeys(key for each in options for key in each)
-    differing = [key for key in keys if len({json.dumps(each.get(key)) for each in options}) > 1]
+    options = [flat({key: value for key, value in run.settings.items() if key not in EXCLUDED}) for run in runs]
+    keys = dict.fromkeys(key for settings in options for key in settings)
+    differing = [key for key in keys if len({json.dumps(settings.get(key)) for settings in options}) > 1]
     rows: dict[str, list[FinishedRun]] = {}
-    for run, each in zip(runs, options, strict=True):
-        shown = [f"{key.removeprefix('twinning.')} {_words(each.get(key))}" for key in differing]
-        rows.setdefault(", ".join(shown) or "all", []).append(run)
+    for run, settings in zip(runs, options, strict=True):
+        labels = [f"{key.removeprefix('twinning.')} {_words(settings.get(key))}" for key in differing]
+        rows.setdefault(", ".join(labels) or "all", []).append(run)
     title = str(runs[0].settings["plant"]).replace("_", " ")
     return Comparison(title, [Row(name=name, runs=row) for name, row in rows.items()])
 
@@ -332,10 +332,10 @@ def with_interval(ratio: dict[str, float | None] | None) -> str:
     """A ratio with its interval, for a table."""
     if ratio is None:
         return ""
-    shown = [f"{value:.3f}" if value < 10.0 else f"{value:.3g}" for value in ratio.values() if value is not None]
+    texts = [f"{value:.3f}" if value < 10.0 else f"{value:.3g}" for value in ratio.values() if value is not None]
     if ratio["low"] in (None, ratio["high"]):  # of one seed, or of a row over itself
-        return shown[0]
-    return f"{shown[0]} [{shown[1]}, {shown[2]}]"
+        return texts[0]
+    return f"{texts[0]} [{texts[1]}, {texts[2]}]"
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -392,7 +392,7 @@ def _numbers(values: Iterable[float | None]) -> list[float]:
 
 
 def _means(merit: dict[str, dict[str, Any]]) -> dict[str, float]:
-    return {name: math.nan if found["mean"] is None else float(found["mean"]) for name, found in merit.items()}
+    return {name: math.nan if quantity["mean"] is None else float(quantity["mean"]) for name, quantity in merit.items()}
 
 
 def _words(value: Any) -> str:

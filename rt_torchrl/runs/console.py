@@ -62,12 +62,12 @@ def recipe(name: str) -> Path:
             raise SystemExit(f"error: {name} does not exist; give the file of a recipe, or a name: {PROGRAM} --help.")
         return path.resolve()
     known = recipes()
-    found = known.get(name.replace("-", "_"))
-    if found is None:
+    file = known.get(name.replace("-", "_"))
+    if file is None:
         near = difflib.get_close_matches(name, known, n=1)
         meant = f"did you mean {near[0]}? " if near else ""
         raise SystemExit(f"error: there is no recipe {name!r}; {meant}{PROGRAM} --help lists them all.")
-    return found
+    return file
 
 
 def call_of(name: str) -> str:
@@ -95,5 +95,5 @@ def listing() -> str:
 
 def purpose(path: Path) -> str:
     """The first sentence of a recipe's docstring."""
-    said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-    return " ".join(said.split("\n\n")[0].split())
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return " ".join(docstring.split("\n\n")[0].split())

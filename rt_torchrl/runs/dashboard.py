@@ -44,8 +44,8 @@ class Dashboard:
         for name, value in final_costs(summary).items():
             self.scalar(f"final/{name}", value)
         unseen = summary["unseen"]
-        each = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
-        for name, costs in each.items():
+        histograms = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
+        for name, costs in histograms.items():
             if None not in costs:  # which stands for a cost that is not finite
                 self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(costs), 0)
         # TensorBoard shows Markdown, in which indented lines are code.
@@ -81,28 +81,28 @@ class Dashboard:
 
 def scalars_of(record: Mapping[str, Any]) -> dict[str, float]:
     """The scalars of an episode by tag: a group and the name in ``metrics.json``, which may have a group of its own."""
-    found = {}
+    scalars = {}
     for name, value in record.items():
         if isinstance(value, float):
             group = next((group for group, begins in GROUPS.items() if name.startswith(begins)), "steps")
-            found[name if "/" in name else f"{group}/{name}"] = value
-    found["switch/live is model-based"] = float(record["live"] == "model_based")
-    found |= {f"switch/{event}": float(record.get("event") == event) for event in ("swap", "clone")}
-    found |= {f"closure/{name}": w for name, w in (record["closure"] or {}).items() if isinstance(w, float)}
-    return found | {f"seconds/{name}": seconds for name, seconds in record["seconds"].items()}
+            scalars[name if "/" in name else f"{group}/{name}"] = value
+    scalars["switch/live is model-based"] = float(record["live"] == "model_based")
+    scalars |= {f"switch/{event}": float(record.get("event") == event) for event in ("swap", "clone")}
+    scalars |= {f"closure/{name}": w for name, w in (record["closure"] or {}).items() if isinstance(w, float)}
+    return scalars | {f"seconds/{name}": seconds for name, seconds in record["seconds"].items()}
 
 
 def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     """Final costs of a run by name; those that are not finite are left out."""
     unseen, paid = summary["unseen"], summary["cost_of_learning"]
     where = " on the twin" if on_the_twin(unseen) else ""
-    found = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in ROLES}
-    found[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
-    found |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    costs = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in ROLES}
+    costs[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
+    costs |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
     flown = summary.get("real_unseen", {}).get("controllers", {})
-    found |= {f"J_a {name} on the real system": one["J_a"]["mean"] for name, one in flown.items()}
-    found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
-    return {name: float(value) for name, value in found.items() if value is not None and np.isfinite(value)}
+    costs |= {f"J_a {name} on the real system": entry["J_a"]["mean"] for name, entry in flown.items()}
+    costs |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
+    return {name: float(value) for name, value in costs.items() if value is not None and np.isfinite(value)}
 
 
 WORDS = {
@@ -151,13 +151,13 @@ class Progress:
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:
-            found = record.get("warning", "the twin's predictions hold again")
-            self.write(f"episode {record['episode'] + 1}: {found}")
+            message = record.get("warning", "the twin's predictions hold again")
+            self.write(f"episode {record['episode'] + 1}: {message}")
         self._alarm = alarm
         believed = record.get("believed")
         if believed != self._believed:
-            said = f"the twin with {believed!r}" if believed else "the twin alone"
-            self.write(f"episode {record['episode'] + 1}: {said} is the likeliest; J_p and closure are its own")
+            twin = f"the twin with {believed!r}" if believed else "the twin alone"
+            self.write(f"episode {record['episode'] + 1}: {twin} is the likeliest; J_p and closure are its own")
         self._believed = believed
         self._bar.update()
         self._show()

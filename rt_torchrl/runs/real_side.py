@@ -157,8 +157,8 @@ def contenders(
 def announcement(names: Iterable[str], live: Role, count: int) -> str:
     """How many flights of whom there will be on the real system, where each controller makes so many."""
     called = [f"the live policy ({live.replace('_', '-')})" if name == live else name for name in names]
-    each = ", ".join(f"{count} of {who}" for who in called)
-    return f"{count * len(called)} flights on the real system: {each}; they count as paid"
+    counts = ", ".join(f"{count} of {who}" for who in called)
+    return f"{count * len(called)} flights on the real system: {counts}; they count as paid"
 
 
 def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role) -> dict[str, Any]:
@@ -173,16 +173,16 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
         live: name of the live policy, which need not have flown.
     """
     controllers = {}
-    for name, found in judged.items():
-        costs = found.control_costs
-        controllers[name] = {"episodes": len(costs)} | found.statistics()
+    for name, judgement in judged.items():
+        costs = judgement.control_costs
+        controllers[name] = {"episodes": len(costs)} | judgement.statistics()
         if name != live and live in flights and _same_episodes(flights[name], flights[live]):
             best = judged[live].control_costs
             ratio = (best.mean() / costs.mean()).item()
             controllers[name] |= {"ratio": ratio, "cheaper": int((best < costs).sum())}
     return {
         "controllers": controllers,
-        "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
+        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
     }
 
 
@@ -203,11 +203,11 @@ def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int)
     if not (folder / "metrics.json").is_file():
         return None
     metrics = read_metrics(folder)
-    found: dict[str, Any] | None = metrics["summary"].get("real_unseen")
-    if found is None or len(metrics["episodes"]) != episodes:
+    entry: dict[str, Any] | None = metrics["summary"].get("real_unseen")
+    if entry is None or len(metrics["episodes"]) != episodes:
         return None
-    flown = {name: one["episodes"] for name, one in found["controllers"].items()}
-    return found if flown == dict.fromkeys(names, count) else None
+    flown = {name: controller["episodes"] for name, controller in entry["controllers"].items()}
+    return entry if flown == dict.fromkeys(names, count) else None
 
 
 def paid_before(folder: Path) -> list[float | None]:

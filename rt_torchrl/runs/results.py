@@ -29,16 +29,16 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
-def episode_record(found: TensorDict, *, episode: int) -> dict[str, Any]:
+def episode_record(entries: TensorDict, *, episode: int) -> dict[str, Any]:
     """One entry of ``episodes`` in ``metrics.json``, in plain numbers.
 
     Args:
-        found: return value of :meth:`ReinforcementTwinning.episode`.
+        entries: return value of :meth:`ReinforcementTwinning.episode`.
         episode: number of the episode, from 0.
     """
     record: dict[str, Any] = {"episode": episode, "event": "keep"}
-    for key in found.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
-        value = found[key]
+    for key in entries.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
+        value = entries[key]
         if key == "seconds":
             record["seconds"] = {step: float(seconds) for step, seconds in value.items()}
         else:
@@ -165,12 +165,12 @@ def twin_costs(
 
 def results(judged: dict[str, Judged]) -> dict[str, Any]:
     """Statistics of all controllers on the unseen episodes."""
-    overall = {name: found.statistics() for name, found in judged.items()}
+    overall = {name: judgement.statistics() for name, judgement in judged.items()}
     return {
         **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
-        "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
+        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
         "merit": {role: overall[role]["merit"] for role in ROLES},
-        "baselines": {name: found for name, found in overall.items() if name not in ROLES},
+        "baselines": {name: statistics for name, statistics in overall.items() if name not in ROLES},
     }
 
 
@@ -181,7 +181,7 @@ def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
     """
     if not isinstance(twin, TwinEnsemble):
         return {}
-    found: dict[str, Any] = {}
+    hypotheses: dict[str, Any] = {}
     for name, weight in twin.weights.items():
         if name != ALONE:
             closure = twin.twins[name].closure
@@ -189,8 +189,8 @@ def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
             parts = closure.extension_parameters if isinstance(closure, ExtendedClosure) else ()
             weights = {key: value for part in parts for key, value in (named_weights(part) or {}).items()}
             described = {key: value for part in parts for key, value in described_weights(part).items()}
-            found[name] = {"weight": weight, "weights": weights, "described": described}
-    return found
+            hypotheses[name] = {"weight": weight, "weights": weights, "described": described}
+    return hypotheses
 
 
 def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | None] = ()) -> dict[str, Any]:
@@ -202,8 +202,8 @@ def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | N
     """
     costs = [record[key] for record in episodes for key in ("start_cost", "real_cost") if key in record]
     costs += [torch.inf if cost is None else cost for cost in judging]
-    found = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
-    return found | ({"judging": list(judging)} if judging else {})
+    paid = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
+    return paid | ({"judging": list(judging)} if judging else {})
 
 
 def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
@@ -244,8 +244,8 @@ def progress(record: dict[str, Any]) -> str:
     errors = {key.removeprefix("rms/"): value for key, value in record.items() if key.startswith("rms/")}
     named = [("J_a mb", "J_a_model_based"), ("J_a mf", "J_a_model_free"), ("real", "real_cost")]
     named = named if errors else [("J_p", "J_p"), *named]
-    shown = [f"{name} {in_words(record[key])}" for name, key in named if record.get(key) is not None]
-    return ", ".join([*rms_words(errors, most=MOST_ERRORS), *shown, f"live {record['live'].replace('_', '-')}"])
+    costs = [f"{name} {in_words(record[key])}" for name, key in named if record.get(key) is not None]
+    return ", ".join([*rms_words(errors, most=MOST_ERRORS), *costs, f"live {record['live'].replace('_', '-')}"])
 
 
 def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
@@ -265,66 +265,66 @@ def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
 
 def results_table(metrics: dict[str, Any]) -> str:
     """The table of results that the terminal shows at the end of a run."""
-    found = metrics["summary"]
-    unseen, n = found["unseen"], found["unseen"]["episodes"]
+    summary = metrics["summary"]
+    unseen, n = summary["unseen"], summary["unseen"]["episodes"]
     where = WHERE.get(unseen["judged_on"], "")
     twin = " on the twin" if on_the_twin(unseen) else ""
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
     lines.append(f"  {'cost':<{width}}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
     # A twin has no J_p on episodes that it has flown itself.
-    rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
+    rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", summary["J_p_ratio"])]
     for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
-        rows.append((f"J_a {role.replace('_', '-')}{twin}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
+        rows.append((f"J_a {role.replace('_', '-')}{twin}", before, f"J_a_{role}", summary[f"J_a_ratio_{role}"]))
     for name, before, after, ratio in rows:
         means = f"{_number(unseen[before]['mean'], '.5g'):>12}{_number(unseen[after]['mean'], '.5g'):>12}"
         lines.append(f"  {name:<{width}}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
-    if "reference" in found:
-        best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
+    if "reference" in summary:
+        best, share = (summary["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
         lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
     lines += merit_lines(unseen)
-    lines += real_lines(found.get("real_unseen"), found["twin"]["segment"])
-    paid = found["cost_of_learning"]
+    lines += real_lines(summary.get("real_unseen"), summary["twin"]["segment"])
+    paid = summary["cost_of_learning"]
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
     lines.append(
-        f"  live at the end: {found['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
+        f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
         f"{paid['episodes']} episodes{judging}, largest {most}"
     )
-    lines += [f"  {sentence}" for sentence in [dearer_than_first(found)] if sentence]
-    lines += hypothesis_lines(found["hypotheses"], found["believed"])
+    lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
+    lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
     lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
-    lines += fit_lines(found["twin"])
-    lines += closure_lines(found["closure"], found["twin"]["standard_errors"])
-    lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
+    lines += fit_lines(summary["twin"])
+    lines += closure_lines(summary["closure"], summary["twin"]["standard_errors"])
+    lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in summary["seconds"].items()))
     return "\n".join(lines)
 
 
-def real_lines(found: dict[str, Any] | None, segment: int) -> list[str]:
+def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
     """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
-    if found is None:
+    if real is None:
         return []
     lines = []
-    if "J_p" in found:
-        before, after = (_number(found[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
+    if "J_p" in real:
+        before, after = (_number(real[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
         over = f", over segments of {segment} intervals" if segment else ""
         lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
-    for name, one in found["controllers"].items():
-        mean, who = _number(one["J_a"]["mean"], ".5g"), name.replace("_", "-")
+    for name, entry in real["controllers"].items():
+        mean, who = _number(entry["J_a"]["mean"], ".5g"), name.replace("_", "-")
         lines.append(
-            f"  J_a on the real system, {one['episodes']} other episodes of {who}: {mean} {_interval(one['J_a'])}"
+            f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean} {_interval(entry['J_a'])}"
         )
-        if "ratio" in one:
-            cheaper = f"cheaper in {one['cheaper']} of {one['episodes']}"
+        if "ratio" in entry:
+            cheaper = f"cheaper in {entry['cheaper']} of {entry['episodes']}"
             lines.append(
-                f"    on the same episodes the live policy costs {_number(one['ratio'], '.4g')} of it, {cheaper}"
+                f"    on the same episodes the live policy costs {_number(entry['ratio'], '.4g')} of it, {cheaper}"
             )
-        lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
+        lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in entry["merit"].items()]
     return lines
 
 
@@ -333,8 +333,8 @@ def _number(value: float | None, digits: str) -> str:
     return "-" if value is None else format(value, digits)
 
 
-def _interval(found: dict[str, Any]) -> str:
-    low, high = (_number(end, ".4g") for end in found["confidence_interval"])
+def _interval(statistics: dict[str, Any]) -> str:
+    low, high = (_number(end, ".4g") for end in statistics["confidence_interval"])
     return f"[{low}, {high}]"
 
 
@@ -351,9 +351,9 @@ def merit_lines(unseen: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _value(found: dict[str, Any]) -> str:
+def _value(merit: dict[str, Any]) -> str:
     """The mean of a quantity, and its median if it has one."""
-    return _number(found["mean"], ".4g") + (f" ({_number(found['median'], '.4g')})" if "median" in found else "")
+    return _number(merit["mean"], ".4g") + (f" ({_number(merit['median'], '.4g')})" if "median" in merit else "")
 
 
 def fit_lines(twin: dict[str, Any]) -> list[str]:
@@ -369,21 +369,21 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | Non
 
     The true weights of the same names and the standard errors are shown, if there are any.
     """
-    found = closure["found"]
-    if not found or not all(isinstance(value, float | None) for value in found.values()):
+    weights = closure["found"]
+    if not weights or not all(isinstance(value, float | None) for value in weights.values()):
         return []
-    if len(found) > MOST_WEIGHTS:
-        return [f"  closure: {len(found)} weights, in metrics.json"]
-    true = {name: value for name, value in (closure.get("true") or {}).items() if name in found}
-    columns = {"start": closure["start"], "found": found}
+    if len(weights) > MOST_WEIGHTS:
+        return [f"  closure: {len(weights)} weights, in metrics.json"]
+    true = {name: value for name, value in (closure.get("true") or {}).items() if name in weights}
+    columns = {"start": closure["start"], "found": weights}
     columns |= {"std. error": errors} if errors else {}
     columns |= {"true": true} if true else {}
     lines = [f"  {'closure weight':<22}" + "".join(f"{column:>12}" for column in columns)]
-    for name in found:
+    for name in weights:
         about = closure["described"].get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{about['unit']}]" if about["unit"] else name
-        shown = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
-        lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
+        cells = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
+        lines.append(f"  {label:<22}{cells}   {about['meaning']}".rstrip())
     return lines
 
 
@@ -395,23 +395,23 @@ def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None = None) ->
         believed: name of the likeliest, whose J_p and closure the table shows.
     """
     lines = []
-    for name, one in hypotheses.items():
-        named = {key: value for key, value in one["weights"].items() if isinstance(value, float)}
-        units = {key: one["described"].get(key, {}).get("unit", "") for key in named}
-        found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
-        line = f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else "")
+    for name, hypothesis in hypotheses.items():
+        named = {key: value for key, value in hypothesis["weights"].items() if isinstance(value, float)}
+        units = {key: hypothesis["described"].get(key, {}).get("unit", "") for key in named}
+        weights = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
+        line = f"  beside the twin: {name}, weight {hypothesis['weight']:.2f}" + (f", {weights}" if weights else "")
         lines.append(line + ("; J_p and closure weights are its own" if name == believed else ""))
     return lines
 
 
 def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     """The number of alarms, and the last one."""
-    watched = [one for one in episodes if "alarm" in one]
+    watched = [record for record in episodes if "alarm" in record]
     if not watched:
         return []
-    raised = sum(one["alarm"] > 0.0 for one in watched)
+    raised = sum(record["alarm"] > 0.0 for record in watched)
     about = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
-    last = [f"  episode {one['episode']}: {one['warning']}" for one in watched if one.get("warning")][-1:]
+    last = [f"  episode {record['episode']}: {record['warning']}" for record in watched if record.get("warning")][-1:]
     return [f"  {about}", *last]
 
 
@@ -435,8 +435,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         folder: run folder.
         config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
     """
-    found, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
-    live, (cost, known, place) = found["live"], costs_at_the_end(found)
+    summary, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
+    live, (cost, known, place) = summary["live"], costs_at_the_end(summary)
     twin = place == "twin"
     best = min(known, key=known.__getitem__, default=None)
     call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
@@ -444,12 +444,12 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
-    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(found)):
+    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
         better = best if best is not None and cost >= known[best] else "the controller that flew first"
         longer = "go on with --resume and more --episodes, or train with more --twinning.planner.iterations"
         steps.append(f"{better} is better than the live policy: keep it, {longer}")
-    elif found["better"] != live:
-        steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
+    elif summary["better"] != live:
+        steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
     elif not alone:
         steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
     elif live == "model_based" and config is not None and config.twinning.planner.method == "receding_horizon":

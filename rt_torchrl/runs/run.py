@@ -119,8 +119,8 @@ class Run:
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector, device=device)
             self.unseen = real_side.judged_on(plant, self.algorithm.twin, real, self.config, device=device)
             self._real, self._device = real, device
-            made = {name: law(physics) for name, law in laws.items()}
-            self.baselines = {name: law.to(device) for name, law in made.items()}
+            controllers = {name: law(physics) for name, law in laws.items()}
+            self.baselines = {name: law.to(device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
             if self._held.resumes():
@@ -247,7 +247,7 @@ class Run:
                     safe_point()
                     self._episode(dashboard, bar)
                     bar.episode(self.episodes[-1])
-                    reasons = [said for callback in self.callbacks if (said := callback(self.episodes))]
+                    reasons = [reason for callback in self.callbacks if (reason := callback(self.episodes))]
                     if reasons:
                         self.ended = "; ".join(reasons)
                         bar.write(f"ended after {len(self.episodes)} episodes: {self.ended}")
@@ -269,8 +269,8 @@ class Run:
             record["faults"] = [fault._asdict() for fault in self.algorithm.flights.faults]
             for fault in self.algorithm.flights.faults:
                 bar.write(f"episode {record['episode'] + 1}, {fault.time:g} s: {fault.kind}: {fault.detail}")
-        every = self.config.unseen_every
-        if every and (len(self.episodes) + 1) % every == 0:
+        interval = self.config.unseen_every
+        if interval and (len(self.episodes) + 1) % interval == 0:
             self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
@@ -314,7 +314,7 @@ class Run:
         episodes.bounds = self.unseen.bounds
         flights = {name: episodes.fly(law) for name, law in laws.items()}
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        self._paid += [cost for found in judged.values() for cost in found.control_costs.tolist()]
+        self._paid += [cost for judgement in judged.values() for cost in judgement.control_costs.tolist()]
         entry = real_side.entries(flights, judged, live)
         if live in flights:
             costs = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
@@ -349,10 +349,10 @@ class Run:
     def _drawn(self, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged]) -> dict[str, np.ndarray]:
         """Draw the figures of the training and of the unseen episodes, into ``figures/``; their pixels by name."""
         live, where = self.algorithm.referee.live, "on the twin" if self.unseen.judged_on == "twin" else ""
-        shown = {who: flown.each()[0] for who, flown in flights.items() if who == live or who not in ROLES}
+        trajectories = {who: flown.each()[0] for who, flown in flights.items() if who == live or who not in ROLES}
         snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
         drawn = {**figures.figures_of(snapshot), **self.config.plant_figures(snapshot)}
-        drawn["flights"] = figures.flights(self.unseen.physics, shown, where=where)
+        drawn["flights"] = figures.flights(self.unseen.physics, trajectories, where=where)
         drawn["unseen"] = figures.unseen(judged, where=where)
         images = {name: figures.pixels(figure) for name, figure in drawn.items()}
         (self.folder / "figures").mkdir(exist_ok=True)

@@ -218,15 +218,15 @@ class RunConfig:
         """
         usual = type(self)()
         preset: Preset = "neural" if self.closure == "mlp" and self.preset == "default" else self.preset
-        found = dataclasses.replace(
+        defaults = dataclasses.replace(
             usual, preset=self.preset, **self.presets()["default" if preset == "mpc" else preset]
         )
         if preset == "mpc":
-            planner = found.twinning.planner
+            planner = defaults.twinning.planner
             planner = dataclasses.replace(planner, method="receding_horizon")
-            found = dataclasses.replace(found, twinning=dataclasses.replace(found.twinning, planner=planner))
-        begun = self if self.start != usual.start else dataclasses.replace(self, start=found.start)
-        return dataclasses.replace(found, twinning=begun.suited(found.twinning))
+            defaults = dataclasses.replace(defaults, twinning=dataclasses.replace(defaults.twinning, planner=planner))
+        with_start = self if self.start != usual.start else dataclasses.replace(self, start=defaults.start)
+        return dataclasses.replace(defaults, twinning=with_start.suited(defaults.twinning))
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Function from an episode's number to the real system's closure; None if the real system does not wear.

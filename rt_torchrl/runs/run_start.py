@@ -49,8 +49,8 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start
-    begun = config.resume and config.log_dir is not None and checkpoints(config.log_dir)
-    if begun or name == "random":
+    resumed = config.resume and config.log_dir is not None and checkpoints(config.log_dir)
+    if resumed or name == "random":
         return lambda physics, closure: None
     if name == "controller":
         if controller is None:
@@ -86,11 +86,11 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
     kind = type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
     for what in ("observations", "actions"):
-        its, ours = (_described(getattr(each, what)) for each in (run.physics, plant))
-        if its != ours:
+        earlier, present = (_described(getattr(physics, what)) for physics in (run.physics, plant))
+        if earlier != present:
             raise ValueError(
-                f"start={str(folder)!r} is a run whose {what} are {', '.join(map(str, its))}; here they are "
-                f"{', '.join(map(str, ours))}. Give the options of that run, such as --observe, or another start."
+                f"start={str(folder)!r} is a run whose {what} are {', '.join(map(str, earlier))}; here they are "
+                f"{', '.join(map(str, present))}. Give the options of that run, such as --observe, or another start."
             )
     _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
     hypotheses = _hypotheses(folder, run.twin, config, plant)
@@ -113,31 +113,31 @@ def _described(signals: tuple[Signal, ...]) -> list[Any]:
     return [(signal.name, signal.unit, signal.low, signal.high) for signal in signals]
 
 
-def _require_same_closure(folder: Path, its: nn.Module, ours: nn.Module) -> None:
-    shapes = [{name: weight.shape for name, weight in each.state_dict().items()} for each in (its, ours)]
-    if type(its) is not type(ours) or shapes[0] != shapes[1]:
+def _require_same_closure(folder: Path, earlier: nn.Module, present: nn.Module) -> None:
+    shapes = [{name: weight.shape for name, weight in closure.state_dict().items()} for closure in (earlier, present)]
+    if type(earlier) is not type(present) or shapes[0] != shapes[1]:
         raise ValueError(
-            f"start={str(folder)!r} is a run whose twin has a closure {type(its).__name__}, which does not fit the "
-            f"{type(ours).__name__} of this run; give that run's --closure."
+            f"start={str(folder)!r} is a run whose twin has a closure {type(earlier).__name__}, which does not fit the "
+            f"{type(present).__name__} of this run; give that run's --closure."
         )
 
 
-def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant) -> dict[str, Any] | None:
+def _hypotheses(folder: Path, earlier: DigitalTwin, config: RunConfig, plant: Plant) -> dict[str, Any] | None:
     """The hypotheses of a run, where this run has some, too: the same ones, or else the run believed none."""
-    ours = make_twin(plant, config.make_closure(plant, torch.Generator()), config.twinning.hypotheses)
-    if not isinstance(its, TwinEnsemble) or not isinstance(ours, TwinEnsemble):
+    twin = make_twin(plant, config.make_closure(plant, torch.Generator()), config.twinning.hypotheses)
+    if not isinstance(earlier, TwinEnsemble) or not isinstance(twin, TwinEnsemble):
         return None
-    found: dict[str, Any] = its.state_dict()["hypotheses"]
+    hypotheses: dict[str, Any] = earlier.state_dict()["hypotheses"]
     try:
-        ours.load_hypotheses(found)
+        twin.load_hypotheses(hypotheses)
     except ValueError as error:
-        if its.hypothesis is None:
+        if earlier.hypothesis is None:
             return None
         raise ValueError(
-            f"start={str(folder)!r} is a run that believes {its.hypothesis!r}, but {error} Give the "
+            f"start={str(folder)!r} is a run that believes {earlier.hypothesis!r}, but {error} Give the "
             "--twinning.hypotheses.which of that run, or --twinning.hypotheses.which none to plan on the twin alone."
         ) from error
-    return found
+    return hypotheses
 
 
 def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
@@ -185,8 +185,8 @@ def known_physics(
             f"{', '.join(read)}, which is all that sensors read; let believed() of the Config give the plant without "
             "its extensions."
         )
-    for one in filter(None, (plant, believed)):
-        check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
+    for model in filter(None, (plant, believed)):
+        check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics)
     given: dict[str, object] = {} if first is None else {"first": first}
     given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
     for name, law in given.items():

@@ -92,19 +92,19 @@ def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
         raise ValueError(f"the recipe that {place} names is not found: {error} If it has moved, {GIVE}.") from error
 
 
-def require_config(found: Any, name: str) -> type[RunConfig]:
+def require_config(config_class: Any, name: str) -> type[RunConfig]:
     """The object, once it is certain that it is a class derived from ``RunConfig``.
 
     Args:
-        found: object to check.
+        config_class: object to check.
         name: name of the object in an error.
 
     Raises:
         ValueError: if it is not such a class.
     """
-    if not (isinstance(found, type) and issubclass(found, RunConfig)):
+    if not (isinstance(config_class, type) and issubclass(config_class, RunConfig)):
         raise ValueError(f"{name} is no class derived from RunConfig.")
-    return found
+    return config_class
 
 
 def _origin(config_class: type) -> dict[str, str | None]:
@@ -124,34 +124,34 @@ HARMLESS = {*BESIDE_TRAINING, "episodes", "unseen_every", "real_unseen"}
 ABSENT = "nothing"
 
 
-def write_settings(folder: Path, asked: RunConfig, effective: RunConfig, plant: str) -> None:
+def write_settings(folder: Path, config: RunConfig, effective: RunConfig, plant: str) -> None:
     """Write ``config.json``: the settings of the run, and ``ran`` with an entry for every start of the run.
 
     Args:
         folder: run folder.
-        asked: options as they were asked for.
+        config: options as they were asked for.
         effective: options that the run carries out.
         plant: name of the plant.
 
     Raises:
         OSError: if the file cannot be written.
     """
-    before = read_settings(folder).get(RAN, []) if asked.resume else []
+    before = read_settings(folder).get(RAN, []) if config.resume else []
     ran = {
         "effective": as_written(effective),
         "versions": versions(),
         "command": shlex.join(sys.argv),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    settings = settings_of(asked, plant) | {RAN: [*before, ran]}
+    settings = settings_of(config, plant) | {RAN: [*before, ran]}
     # Options may be infinite; JSON as Python writes it keeps them as they are.
     write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
 
 
 def versions() -> dict[str, str]:
     """Versions of Python, this library and the libraries it computes with."""
-    found = {"python": platform.python_version(), "rt_torchrl": rt_torchrl.__version__}
-    return found | {name: importlib.metadata.version(name) for name in VERSIONS_OF}
+    versions = {"python": platform.python_version(), "rt_torchrl": rt_torchrl.__version__}
+    return versions | {name: importlib.metadata.version(name) for name in VERSIONS_OF}
 
 
 def as_written(config: RunConfig) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def as_written(config: RunConfig) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
-def require_same(folder: Path, asked: RunConfig) -> None:
+def require_same(folder: Path, config: RunConfig) -> None:
     """Refuse to go on with a run under options that differ from its own, except for harmless ones.
 
     ``unseen`` is harmless too if the run has not judged any training episode on the unseen episodes.
@@ -168,45 +168,45 @@ def require_same(folder: Path, asked: RunConfig) -> None:
         ValueError: if an option differs; it names each such option with both values.
     """
     judged = flat(read_settings(folder)).get("unseen_every")
-    if found := differences(folder, asked, HARMLESS if judged else HARMLESS | {"unseen"}):
+    if changed := differences(folder, config, HARMLESS if judged else HARMLESS | {"unseen"}):
         raise ValueError(
-            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(found)}. Give the run's "
+            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(changed)}. Give the run's "
             "own options, or another folder for a new run."
         )
 
 
-def differences(folder: Path, asked: RunConfig, harmless: AbstractSet[str] = HARMLESS) -> list[str]:
+def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str] = HARMLESS) -> list[str]:
     """What differs between the options of a run and those that are asked for, in words.
 
     Args:
         folder: run folder.
-        asked: options as they are asked for.
+        config: options as they are asked for.
         harmless: options that may differ.
 
     Raises:
         ValueError: if the folder is not a run folder, or its settings are damaged.
     """
-    its = flat(read_settings(folder))
-    asks = flat(as_written(asked))
-    found = []
-    for name in sorted(its.keys() | asks.keys()):
+    earlier = flat(read_settings(folder))
+    present = flat(as_written(config))
+    sentences = []
+    for name in sorted(earlier.keys() | present.keys()):
         if name.split(".")[0] in {*harmless, *BESIDE}:
             continue
-        was, now = its.get(name, ABSENT), asks.get(name, ABSENT)
+        was, now = earlier.get(name, ABSENT), present.get(name, ABSENT)
         if was != now:
-            found.append(f"{name} is {now} here and was {was} in the run")
-    return found
+            sentences.append(f"{name} is {now} here and was {was} in the run")
+    return sentences
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested options by their dotted names, as the command line has them."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, dict) and value:
-            found |= flat(value, f"{prefix}{name}.")
+            options |= flat(value, f"{prefix}{name}.")
         else:
-            found[prefix + name] = value
-    return found
+            options[prefix + name] = value
+    return options
 
 
 PREFIX = "rt_torchrl_recipe_"
