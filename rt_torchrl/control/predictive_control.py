@@ -131,28 +131,28 @@ class RecedingHorizon:
         Raises:
             DivergenceError: if the model diverges under every start of a first plan.
         """
-        first, found = not self._plans, []
+        first, plans = not self._plans, []
         for episode, coming in enumerate(self.forecast(t, exogenous, self.horizon)):
             safe_point()
             began = time.perf_counter()
             self.cost.begin(state[episode], coming, start=t)
             last = None if first else self._shifted(self._plans[episode])
-            found.append(self._solved(last, began))
-        self._plans = found
-        return torch.stack([self.cost.commands(plan) for plan in found])
+            plans.append(self._solved(last, began))
+        self._plans = plans
+        return torch.stack([self.cost.commands(plan) for plan in plans])
 
     def _solved(self, last: Plan | None, began: float) -> Plan:
         """The plan of an episode; where the model diverges under the last plan, this or a constant command goes on."""
         start, config = self._cheapest(self._constants()) if last is None else last, self.config
         diverged = False
         try:
-            found = descend(self.cost, start, iterations=config.iterations, tolerance=config.tolerance).point
+            plan = descend(self.cost, start, iterations=config.iterations, tolerance=config.tolerance).point
         except FloatingPointError as error:
             if last is None:
                 raise DivergenceError(f"plant {self.plant.name!r} diverges in every first plan: {error}") from error
-            found, diverged = self._cheapest([last, *self._constants()]), True
+            plan, diverged = self._cheapest([last, *self._constants()]), True
         self.solves.append(Solve(time.perf_counter() - began, diverged))
-        return found
+        return plan
 
     def _shifted(self, plan: Plan) -> Plan:
         """The rest of the last plan, whose end is held for as long as the window needs."""
@@ -295,7 +295,7 @@ class PredictiveControl(nn.Module):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PredictiveControl":
         # The machine code of a solve cannot be copied.
-        found = PredictiveControl(self._acting.plant, copy.deepcopy(self.closure, memo), self._acting.config)
-        found.load_state_dict(self.state_dict())
-        memo[id(self)] = found
-        return found
+        duplicate = PredictiveControl(self._acting.plant, copy.deepcopy(self.closure, memo), self._acting.config)
+        duplicate.load_state_dict(self.state_dict())
+        memo[id(self)] = duplicate
+        return duplicate

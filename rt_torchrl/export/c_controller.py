@@ -68,8 +68,8 @@ class CController:
         self.parts = _traced(controller)
         functions = [function for function, _ in self.parts.values()]
         self.read = sorted(set().union(*(f.reads(word) for f in functions for word in ("measured", "last"))))
-        every = [*(plant.states[k] for k in controller.measured), *plant.inputs]
-        self.signals = [every[k] for k in self.read]
+        signals = [*(plant.states[k] for k in controller.measured), *plant.inputs]
+        self.signals = [signals[k] for k in self.read]
         lengths = {"command": len(plant.actions), "memory": len(controller.held), "last": len(self.signals)}
         self.arrays = {array: n for array, n in lengths.items() if n}
 

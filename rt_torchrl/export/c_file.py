@@ -135,8 +135,8 @@ def add_function(
             inputs[argument, 0] = argument
             continue
         declared.append(f"const double *{argument}")
-        taken = (places or {}).get(argument, range(value.shape[1]))
-        inputs |= {(argument, k): f"{argument}[{place}]" for place, k in enumerate(taken)}
+        positions = (places or {}).get(argument, range(value.shape[1]))
+        inputs |= {(argument, k): f"{argument}[{place}]" for place, k in enumerate(positions)}
     outputs = [(f"{output}[{k}]", x) for output, values in function.outputs.items() for k, x in enumerate(values)]
     declared += [f"double *{output}" for output in function.outputs]
     head = f"{kind} {name}({', '.join(declared)})"
@@ -222,13 +222,13 @@ def write_c(
     Raises:
         ValueError: if the file does not compile without a warning, or the comparison fails; then nothing is written.
     """
-    header, result, found = path.with_suffix(".h"), None, compiler()
+    header, result, cc = path.with_suffix(".h"), None, compiler()
     note = f"/* See {header.name} for what goes in and out. Written by rt_torchrl; do not edit. */"
     texts = {
         header: header_text(name, comment, declarations),
         path: f'{note}\n\n#include "{header.name}"\n\n#include <math.h>\n\n{source.text()}',
     }
-    if found is None:
+    if cc is None:
         warnings.warn(
             f"{name} was not checked: there is no C compiler here ({', '.join(COMPILERS)}). Compare it where you "
             "compile it.",
@@ -238,7 +238,7 @@ def write_c(
         with tempfile.TemporaryDirectory() as folder:
             for file, text in texts.items():
                 Path(folder, file.name).write_text(text, encoding="utf-8")
-            result = compare(ctypes.CDLL(str(compile_c(found, Path(folder, path.name), *STRICT))))
+            result = compare(ctypes.CDLL(str(compile_c(cc, Path(folder, path.name), *STRICT))))
     for file, text in texts.items():
         write_atomically(file, text.encode("utf-8"))
     return result

@@ -168,11 +168,11 @@ def _flights(plant: Plant, closure: nn.Module) -> tuple[dict[str, Tensor], Float
 
 
 def _about_twin(plant: Plant, closure: nn.Module, name: str) -> list[str]:
-    read, every = len(plant.readings), len(plant.states)
+    read, total = len(plant.readings), len(plant.states)
     rest = [
         f"No sensor reads the last {plant.unread} of the states. At the start of an episode they follow:",
         "",
-        f"    {name}_rest(read, state);    read has the first {read} states, state all {every}, maybe in its place",
+        f"    {name}_rest(read, state);    read has the first {read} states, state all {total}, maybe in its place",
         "",
     ]
     return [

@@ -55,13 +55,13 @@ class Controller:
         Raises:
             ValueError: if the plant starts another number of states than it names.
         """
-        found = self.plant.controller_start(measured, inputs)
-        if found.shape[-1:] != (len(self.held),):
+        start = self.plant.controller_start(measured, inputs)
+        if start.shape[-1:] != (len(self.held),):
             raise ValueError(
-                f"controller_start of plant {self.plant.name!r} returns shape {tuple(found.shape)}; its last dimension "
+                f"controller_start of plant {self.plant.name!r} returns shape {tuple(start.shape)}; its last dimension "
                 f"must be {len(self.held)}, the number of controller_states."
             )
-        return found
+        return start
 
     def act(
         self,
@@ -114,11 +114,11 @@ class Controller:
         measured, held = ([k for k in places if k < n] for places in (self.measured, self.held))
         order = torch.tensor([*measured, *held]).argsort()
 
-        def given(t: Tensor, state: Tensor, action: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
-            own = field(t, state, action, exogenous, closure)[..., held]
-            return torch.cat([rate[..., : len(measured)], own], -1)[..., order]
+        def vector_field(t: Tensor, state: Tensor, action: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
+            held_rates = field(t, state, action, exogenous, closure)[..., held]
+            return torch.cat([rate[..., : len(measured)], held_rates], -1)[..., order]
 
-        vars(inner)["vector_field"] = given
+        vars(inner)["vector_field"] = vector_field
         return self._moving
 
     def joined(self, measured: Tensor, memory: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ def interface(plant: Plant) -> dict[str, Any]:
     return {
         "plant": plant.name,
         "control_interval_s": plant.dt,
-        "observation": [one | more for one, more in zip(described(plant.observations), observed, strict=True)],
+        "observation": [signal | more for signal, more in zip(described(plant.observations), observed, strict=True)],
         "action": described(plant.actions),
     }
 

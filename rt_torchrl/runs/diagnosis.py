@@ -88,14 +88,14 @@ def _classical(run: LoadedRun) -> Reason:
     """Whether a classical controller was cheaper at the end, on the real system where it was flown."""
     name = "a classical controller is better"
     remedy = "more twinning.planner.iterations and realisations, observations of what that controller reads, or it"
-    own, known, where = costs_at_the_end(run.metrics["summary"])
-    if own is None or not known:
+    cost, known, where = costs_at_the_end(run.metrics["summary"])
+    if cost is None or not known:
         return Reason(
             name, None, "no classical controller flew beside the policy, or the policy has no finite cost", remedy
         )
     best = min(known, key=known.__getitem__)
-    evidence = f"{best} costs {known[best]:.4g}, the policy {own:.4g} ({where})"
-    return Reason(name, known[best] < own, evidence, remedy)
+    evidence = f"{best} costs {known[best]:.4g}, the policy {cost:.4g} ({where})"
+    return Reason(name, known[best] < cost, evidence, remedy)
 
 
 def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, costs: Costs) -> tuple[Costs, Reason]:
@@ -134,9 +134,9 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, b
     window = run.config.twinning.planner.receding_horizon
     controller = PredictiveControl(unseen.plant, unseen.known_closure(), window)
     controller.learn(validation.exogenous)
-    found = unseen.control_costs(controller)
-    evidence = f"model predictive control costs {found.mean():.4g} on the twin, the best of the class {best.mean():.4g}"
-    holds = None if _dearer(found, best, CLASS) else _dearer(best, found, CLASS)
+    costs = unseen.control_costs(controller)
+    evidence = f"model predictive control costs {costs.mean():.4g} on the twin, the best of the class {best.mean():.4g}"
+    holds = None if _dearer(costs, best, CLASS) else _dearer(best, costs, CLASS)
     return Reason(name, holds, evidence, remedy)
 
 
@@ -166,14 +166,14 @@ def _merits(run: LoadedRun) -> Reason:
     merit = unseen["merit"][live]
     if not merit or not others:
         return Reason(name, None, "no classical controller flew beside the policy, or the plant has no merit", remedy)
-    own, apart = unseen[f"J_a_{live}"]["mean"], []
+    cost, differences = unseen[f"J_a_{live}"]["mean"], []
     for key, other in others.items():
-        if own is None or other["J_a"]["mean"] is None or own >= other["J_a"]["mean"]:
+        if cost is None or other["J_a"]["mean"] is None or cost >= other["J_a"]["mean"]:
             continue
         for quantity, value in merit.items():
             mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
             if None not in (mean, its_mean) and abs(mean - its_mean) > MERIT * abs(its_mean):
-                apart.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
-    if apart:
-        return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(apart)}", remedy)
+                differences.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
+    if differences:
+        return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(differences)}", remedy)
     return Reason(name, False, "it is cheaper than no classical controller, or alike in every merit", remedy)

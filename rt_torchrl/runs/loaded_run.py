@@ -168,7 +168,7 @@ class LoadedRun:
         if self.config.wear(self.plant) is None:
             return self.plant.closure
         # Flights that were refused wear the system, too; in an asynchronous run an episode has several windows.
-        flights = sum(each.get("windows", 1) + each.get("episodes_refused", 0) for each in self.metrics["episodes"])
+        flights = sum(entry.get("windows", 1) + entry.get("episodes_refused", 0) for entry in self.metrics["episodes"])
         return worn_closure(self.config, self.plant, int(flights))
 
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
@@ -244,9 +244,9 @@ def load_run(
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant
     generator = torch.Generator().manual_seed(config.seed)
-    made = config.make_policies(physics, generator)
+    untrained = config.make_policies(physics, generator)
     closure = config.make_closure(physics, generator)
-    policies: dict[str, nn.Module] = dict(config.acting_policies(made, physics, closure).items())
+    policies: dict[str, nn.Module] = dict(config.acting_policies(untrained, physics, closure).items())
     initial = copy.deepcopy(closure)
     for role, part in {**policies, "closure": closure}.items():
         try:
@@ -343,13 +343,13 @@ def _rows(given: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tenso
 
 
 def _inputs(plant: Plant, exogenous: Tensor, count: int) -> Tensor:
-    acting, every = len(plant.acting_inputs), len(plant.inputs)
+    acting, total = len(plant.acting_inputs), len(plant.inputs)
     n, width = (*exogenous.shape[-2:],) if exogenous.dim() >= 2 else (0, 0)
-    if n < 1 or width not in (acting, every):
+    if n < 1 or width not in (acting, total):
         names = ", ".join(signal.name for signal in plant.acting_inputs)
         raise ValueError(
             f"exogenous of shape {tuple(exogenous.shape)} must have a row for each control interval and a column for "
             f"each input ({names or 'none'})."
         )
     rows = _rows(exogenous, "exogenous", count, (n, width))
-    return rows if width == every else plant.with_previews(rows)
+    return rows if width == total else plant.with_previews(rows)

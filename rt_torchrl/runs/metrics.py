@@ -47,7 +47,7 @@ def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str
     if live in flown:
         judged, where = dict(flown), "real system"
     cost = judged.pop(live)["J_a"]["mean"]
-    means = {name: one["J_a"]["mean"] for name, one in judged.items()}
+    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
     return cost, {name: mean for name, mean in means.items() if mean is not None}, where
 
 
@@ -71,7 +71,7 @@ def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any],
             "by --resume and --real-unseen, which flies its live policy on the real system."
         )
     flown = real["controllers"]
-    others = {name: found for name, found in flown.items() if name != live}
-    merit = {name: found["merit"] for name, found in flown.items()}
+    others = {name: entry for name, entry in flown.items() if name != live}
+    merit = {name: entry["merit"] for name, entry in flown.items()}
     count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
     return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live

@@ -155,8 +155,8 @@ def save_checkpoint(folder: Path, algorithm: "ReinforcementTwinning", episodes: 
 
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a run, latest first."""
-    found = {file: file.stem.removeprefix("checkpoint-") for file in folder.glob("checkpoint-*.pt")}
-    numbers = {file: int(number) for file, number in found.items() if number.isdecimal()}
+    numerals = {file: file.stem.removeprefix("checkpoint-") for file in folder.glob("checkpoint-*.pt")}
+    numbers = {file: int(number) for file, number in numerals.items() if number.isdecimal()}
     return sorted(numbers, key=numbers.__getitem__, reverse=True)
 
 
@@ -173,35 +173,35 @@ def load_checkpoint(folder: Path, algorithm: "ReinforcementTwinning") -> list[di
     damaged: dict[Path, DamagedFileError] = {}
     for file in checkpoints(folder):
         try:
-            found = _read(file)
+            checkpoint = _read(file)
         except DamagedFileError as error:
             damaged[file] = error
             continue
         try:
-            _restore(file, found, algorithm)
+            _restore(file, checkpoint, algorithm)
         except ValueError as error:
             raise ValueError(f"{error} {ANEW}") from error
-        _set_aside(damaged, file, len(found["episodes"]))
-        return found["episodes"]
+        _set_aside(damaged, file, len(checkpoint["episodes"]))
+        return checkpoint["episodes"]
     reasons = " ".join(map(str, damaged.values())) or f"{folder} holds no checkpoint to go on from."
     raise ValueError(f"{reasons} {ANEW}")
 
 
 def _read(file: Path) -> dict[str, Any]:
     """The content of a checkpoint of any format."""
-    found = load_tensors(file)
-    if not {"format", "episodes", "state"} <= found.keys():
+    checkpoint = load_tensors(file)
+    if not {"format", "episodes", "state"} <= checkpoint.keys():
         raise DamagedFileError(
-            f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, found)) or 'nothing'}."
+            f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, checkpoint)) or 'nothing'}."
         )
-    return found
+    return checkpoint
 
 
-def _restore(file: Path, found: dict[str, Any], algorithm: "ReinforcementTwinning") -> None:
+def _restore(file: Path, checkpoint: dict[str, Any], algorithm: "ReinforcementTwinning") -> None:
     """Put an algorithm that was built with the same configuration into the state of a checkpoint."""
-    if found["format"] != FORMAT:
-        raise ValueError(f"{file} has checkpoint format {found['format']}; this version reads format {FORMAT}.")
-    name, state = algorithm.twin.plant.name, found["state"]
+    if checkpoint["format"] != FORMAT:
+        raise ValueError(f"{file} has checkpoint format {checkpoint['format']}; this version reads format {FORMAT}.")
+    name, state = algorithm.twin.plant.name, checkpoint["state"]
     if state.get("plant") != name:
         raise ValueError(
             f"the checkpoint is of plant {state.get('plant')!r}, this training of {name!r}; use its recipe."
@@ -244,17 +244,17 @@ class RunFolder:
 
     def __init__(self, config: RunConfig, plant: str):
         self._config, self._plant = config, plant
-        self.path = self._made()
+        self.path = self._make_path()
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
         self.hold()
         try:
-            self._require_own()
+            self._require_consistent()
         except BaseException:
             self.release()
             raise
 
-    def _made(self) -> Path:
+    def _make_path(self) -> Path:
         parent = Path("runs") / self._plant
         make_folder("log_dir", self._config.log_dir or parent)
         return self._config.log_dir or new_folder(parent, f"-seed-{self._config.seed}")
@@ -282,12 +282,12 @@ class RunFolder:
         """Let other trainings use the folder."""
         self._lock.release(force=True)
 
-    def _require_own(self) -> None:
+    def _require_consistent(self) -> None:
         if not self._config.resume:
             if any((self.path / name).exists() for name in WRITTEN):
                 raise ValueError(f"log_dir={self.path} holds a run already; --resume it, or choose another folder.")
             return
-        if not self.begun():
+        if not self.holds_run():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         require_same(self.path, self._config)
         if not checkpoints(self.path) and any((self.path / name).exists() for name in RESULTS):
@@ -297,12 +297,12 @@ class RunFolder:
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        there = bool(checkpoints(self.path))
-        if self._config.resume and not there:
+        resumable = bool(checkpoints(self.path))
+        if self._config.resume and not resumable:
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
-        return self._config.resume and there
+        return self._config.resume and resumable
 
-    def begun(self) -> bool:
+    def holds_run(self) -> bool:
         """Whether the folder holds a run: its options are written when it begins."""
         return (self.path / FILE).is_file()
 
