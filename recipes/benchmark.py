@@ -130,8 +130,8 @@ def engine_of(engine: rt.Engine, system: System) -> Contender:
             return rollout.costs(*scenario).mean().item()
 
         def gradient() -> Tensor:
-            parts = torch.autograd.grad(rollout.costs(*scenario).mean(), weights)
-            return torch.cat([part.flatten() for part in parts])
+            gradients = torch.autograd.grad(rollout.costs(*scenario).mean(), weights)
+            return torch.cat([g.flatten() for g in gradients])
 
         return Calls(forward, gradient)
 
@@ -171,8 +171,8 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
 
 def predicted(rows: Sequence[Row], contender: str, steps: int, realisations: int) -> float:
     """Time of a gradient [s] that smaller sizes predict, in proportion to the steps and to more realisations."""
-    known = [row for row in rows if row.contender == contender]
-    times = [r.gradient * steps / r.steps * max(1.0, realisations / r.realisations) for r in known]
+    earlier = [row for row in rows if row.contender == contender]
+    times = [r.gradient * steps / r.steps * max(1.0, realisations / r.realisations) for r in earlier]
     return min(times, default=0.0)
 
 
@@ -205,10 +205,10 @@ def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
         title = f"{plant}, {config.policy} policy, threads: {config.threads}"
         figure, axes = panels(1, 2, title=title, size=(10.5, 4.0), sharey="row")
         for ax, quantity in zip(axes[0], QUANTITIES, strict=True):
-            drawn = [row for row in rows if (row.plant, row.realisations) == (plant, batch)]
-            for k, who in enumerate(dict.fromkeys(row.contender for row in drawn)):
-                x, y = zip(*((r.steps, getattr(r, quantity)) for r in drawn if r.contender == who), strict=True)
-                ax.plot(x, y, "osv^D*P"[k % 7] + "-", color=COLOURS.get(who, f"C{k}"), label=who.replace("_", " "))
+            timed = [row for row in rows if (row.plant, row.realisations) == (plant, batch)]
+            for k, name in enumerate(dict.fromkeys(row.contender for row in timed)):
+                x, y = zip(*((r.steps, getattr(r, quantity)) for r in timed if r.contender == name), strict=True)
+                ax.plot(x, y, "osv^D*P"[k % 7] + "-", color=COLOURS.get(name, f"C{k}"), label=name.replace("_", " "))
             ax.set(xscale="log", yscale="log", xlabel="control intervals")
             caption(ax, f"{quantity} [s]", f"{batch} realisations")
         legend_below(figure, list(axes.flat))

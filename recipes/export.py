@@ -56,13 +56,13 @@ class Config:
 
     def __post_init__(self):
         formats = DEFAULT if self.formats is None else self.formats
-        for option, given, known in (("what", self.what, FORMATS), ("formats", formats, KINDS)):
-            if not given or not set(given) <= set(known):
-                raise ValueError(f"{option}={given} must be some of {', '.join(known)}.")
+        for option, chosen, allowed in (("what", self.what, FORMATS), ("formats", formats, KINDS)):
+            if not chosen or not set(chosen) <= set(allowed):
+                raise ValueError(f"{option}={chosen} must be some of {', '.join(allowed)}.")
         for what in self.what:
             if not set(FORMATS[what]) & set(formats):
-                known = " or ".join(FORMATS[what])
-                raise ValueError(f"formats={formats} holds no format of the {what}; add {known}.")
+                allowed = " or ".join(FORMATS[what])
+                raise ValueError(f"formats={formats} holds no format of the {what}; add {allowed}.")
         for kind in self.formats or ():
             if not any(kind in FORMATS[what] for what in self.what):
                 raise ValueError(

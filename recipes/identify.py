@@ -138,11 +138,11 @@ def main(config: Config) -> None:
     metrics["held_back"] = held_back(plant, parts.segments)
     write_json(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
-    drawn = {
+    figures = {
         "twin_and_log": charts.twin_and_sensors(identified),
         "correlations": charts.correlations(identified.estimate.uncertainty),
     }
-    for name, figure in drawn.items():
+    for name, figure in figures.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
     print(table(metrics))
     print(f"results in {folder}")

@@ -169,21 +169,21 @@ class DDPG:
 
     def train_critic(self) -> None:
         """Lines 14 to 19; fifty batches are drawn at once, after which their TD errors are refreshed (l. 18)."""
-        for drawn in self._draws(self.config.critic_iterations):
+        for sample in self._draws(self.config.critic_iterations):
             errors = list[Tensor]()
-            for batch in drawn.split(self.batch_size):
+            for batch in sample.split(self.batch_size):
                 earlier = [weight.detach().clone() for weight in self.w_q]
                 self._step(batch, "loss_value", self.critic_adam, self.w_q)
                 errors.append(batch["td_error"].detach().sqrt().flatten())
                 with torch.no_grad():
                     for weight, w in zip(self.w_q, earlier, strict=True):  # l. 17
                         weight.copy_(torch.lerp(w, weight, self.config.target_rate))
-            self.memory.refresh(drawn["index"], torch.cat(errors))
+            self.memory.refresh(sample["index"], torch.cat(errors))
 
     def train_policy(self) -> None:
         """Lines 20 to 24."""
-        for drawn in self._draws(self.config.actor_iterations):
-            for batch in drawn.split(self.batch_size):
+        for sample in self._draws(self.config.actor_iterations):
+            for batch in sample.split(self.batch_size):
                 self._step(batch, "loss_actor", self.actor_adam, self.w_a)
 
     def _draws(self, count: int) -> Iterator[TensorDictBase]:

@@ -208,12 +208,12 @@ def main(config: Config) -> None:
     metrics = [read_metrics(training.folder) | {"seed": training.seed} for training in trainings]
     costs = [result["summary"]["unseen"][f"J_a_{result['summary']['live']}"]["mean"] for result in metrics]
     run = rt.load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
-    drawn = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
-    drawn["prediction"] = prediction(run)
-    drawn |= {name: draw(run) for name, draw in OF_A_PLANT.get(config.plant, {}).items()}
-    drawn |= {name: run.figure(name) for name in OF_A_RUN[config.plant]}
+    figures = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
+    figures["prediction"] = prediction(run)
+    figures |= {name: draw(run) for name, draw in OF_A_PLANT.get(config.plant, {}).items()}
+    figures |= {name: run.figure(name) for name in OF_A_RUN[config.plant]}
     (folder / "figures").mkdir(exist_ok=True)
-    for name, figure in drawn.items():
+    for name, figure in figures.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
     print(table(config.plant, metrics))
     print(f"figures in {folder / 'figures'}")

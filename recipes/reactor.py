@@ -103,10 +103,10 @@ def real_system(plant: Reactor, *, seed: int = 0) -> "rt.RealSystem":
         "o_space": {"low": np.float32([0.0, 250.0, 0.0]), "high": np.float32([1.0, 500.0, 1.0])},
         "disturbance_bounds": {"low": np.float32([300.0]), "high": np.float32([400.0])},
     }
-    drawn = {"x0": np.zeros(3), "SP": {"Ca": [0.0]}, "disturbances": {"Ti": [350.0]}}
+    defaults = {"x0": np.zeros(3), "SP": {"Ca": [0.0]}, "disturbances": {"Ti": [350.0]}}
     options = {"model": "cstr", "N": n, "tsim": n * plant.dt / 60.0, "normalise_a": False, "normalise_o": False}
-    state, exogenous = rt.Reading(of=lambda seen: seen[..., :2]), rt.Reading(of=lambda seen: seen[..., 2:])
-    machine = GymWrapper(Episodes(options | ranges | drawn))
+    state, exogenous = rt.Reading(of=lambda obs: obs[..., :2]), rt.Reading(of=lambda obs: obs[..., 2:])
+    machine = GymWrapper(Episodes(options | ranges | defaults))
     return rt.RealSystem(machine, plant, state=state, exogenous=exogenous, seed=seed)
 
 

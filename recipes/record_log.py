@@ -59,17 +59,17 @@ class Config:
     gap: Annotated[float, Field(ge=0, lt=0.5)] = 0.02
 
     def __post_init__(self):
-        known = [state.name for state in logged_states(plant_class(self.plant))]
-        unknown = [name for name in self.states if name not in known]
+        names = [state.name for state in logged_states(plant_class(self.plant))]
+        unknown = [name for name in self.states if name not in names]
         if unknown:
-            raise ValueError(f"states={unknown} of {self.plant!r} do not exist; choose of {', '.join(known)}.")
+            raise ValueError(f"states={unknown} of {self.plant!r} do not exist; choose of {', '.join(names)}.")
 
 
 def main(config: Config) -> None:
     plant = plant_class(config.plant)(**({} if config.horizon is None else {"horizon": config.horizon}))
     generator = torch.Generator().manual_seed(config.seed)
-    known = CONTROLLERS.get(plant.name)
-    law = known(plant).act if known else policy_law(plant, plant.make_policy(generator))
+    controller = CONTROLLERS.get(plant.name)
+    law = controller(plant).act if controller else policy_law(plant, plant.make_policy(generator))
     log = recorded(plant, law, generator, jitter=0.0 if plant.own_scheme else JITTER, noise=config.noise)
     share = log.times / log.times[-1]
     log = log.chosen((share <= 0.5) | (share > 0.5 + config.gap))

@@ -73,8 +73,8 @@ class ServedPlant:
 
     def published(self) -> dict[str, float]:
         """The tags that a client reads, at the beginning of an interval."""
-        seen = self._state[:, : len(self.plant.readings)], self._inputs[:, self._k], self._applied
-        return dict(zip(self.read, [float(self.sample), *torch.cat(seen, -1)[0].tolist()], strict=True))
+        values = self._state[:, : len(self.plant.readings)], self._inputs[:, self._k], self._applied
+        return dict(zip(self.read, [float(self.sample), *torch.cat(values, -1)[0].tolist()], strict=True))
 
     @torch.no_grad()
     def advance(self, command: list[float], answered: float) -> None:

@@ -373,14 +373,14 @@ def write(config: Config, comparisons: Sequence[rt.Comparison]) -> str:
     from rt_torchrl.figures import save_figure
     from rt_torchrl.runs.compare import comparison_figure
 
-    parts = []
+    sections = []
     if max(len(comparison.rows) for comparison in comparisons) > 1:
         first = comparisons[0].rows[0].name
-        parts += [f"## J_a at the end over that of {first}", overview(comparisons, "J_a_ratio")]
-        parts += [f"## Σ J_a of the real episodes over that of {first}", overview(comparisons, "paid_ratio")]
+        sections += [f"## J_a at the end over that of {first}", overview(comparisons, "J_a_ratio")]
+        sections += [f"## Σ J_a of the real episodes over that of {first}", overview(comparisons, "paid_ratio")]
     for comparison in comparisons:
-        parts += [f"## {comparison.title}", comparison.table()]
-    text = "\n\n".join(parts) + "\n"
+        sections += [f"## {comparison.title}", comparison.table()]
+    text = "\n\n".join(sections) + "\n"
     write_atomically(config.log_dir / "study.md", text.encode())
     systems = {comparison.title: comparison.numbers() for comparison in comparisons}
     write_json(config.log_dir / "study.json", {"config": config, "systems": systems})
@@ -419,11 +419,11 @@ def comparisons_of(
     for key, search in searches.items():
         if finished[key] and (kept := search.kept()):
             path, config = search.path, trainings[key][0].config()
-            sought = math.inf if kept["J_a"] is None else kept["J_a"]
+            cost = math.inf if kept["J_a"] is None else kept["J_a"]
             # Model predictive control in the place of the model-based policy is of another class.
             plans = config.twinning.planner.method == "receding_horizon"
             of_class = (run.cost for run in finished[key] if run.live == "model_free" or not plans)
-            least[path] = min([least.get(path, sought), *of_class])
+            least[path] = min([least.get(path, cost), *of_class])
     rows: dict[str, list[Row]] = {}
     for (system, arm), runs in finished.items():
         search = searches.get((system, arm))

@@ -38,7 +38,7 @@ Widths = Annotated[tuple[AtLeastOne, ...], Field(strict=False)]
 """Widths of hidden layers."""
 File = Annotated[Path, Field(strict=False)]
 """A path, for which a text may stand."""
-Text = Annotated[str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)]
+Text = Annotated[str, BeforeValidator(lambda value: str(value) if isinstance(value, Path) else value)]
 """A text, for which a path may stand."""
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
@@ -90,9 +90,9 @@ def configuration(options: type[Options]) -> type[Options]:
     validated = model.__init__
 
     @functools.wraps(validated)
-    def init(self: Any, /, *args: Any, **given: Any) -> None:
+    def init(self: Any, /, *args: Any, **kwargs: Any) -> None:
         try:
-            validated(self, *args, **given)
+            validated(self, *args, **kwargs)
         except ValidationError as error:
             raise ValueError(in_words(error, type(self))) from None
 

@@ -79,15 +79,15 @@ def nrel5mw() -> Any:
 def silenced() -> Iterator[None]:
     """A context in which neither Python nor the compiled controller, which bypasses Python, writes to the terminal."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout = os.dup(1)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         try:
             with contextlib.redirect_stdout(nowhere):
                 yield
         finally:
-            os.dup2(kept, 1)
-            os.close(kept)
+            os.dup2(stdout, 1)
+            os.close(stdout)
 
 
 class Answer:
@@ -234,7 +234,7 @@ class RoscoController(RealController):
         """The episodes that :func:`rosco_turbine` runs from the same seed."""
         episodes = [self._episode(episode_seed(seed, number)) for number in range(count)]
         device = turbine_of(self.plant).greatest_increment.device
-        states, applied, wind = (torch.stack(part).to(device) for part in zip(*episodes, strict=True))
+        states, applied, wind = (torch.stack(values).to(device) for values in zip(*episodes, strict=True))
         return Trajectory(states, applied, wind.unsqueeze(-1))
 
     def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:

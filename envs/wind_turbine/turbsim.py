@@ -168,8 +168,8 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
         raise ValueError(
             f"{path}: is truncated, it holds {size} bytes, but the header alone takes {HEADER.itemsize} bytes. {AGAIN}"
         )
-    read = np.fromfile(path, HEADER, 1)[0]
-    header = SimpleNamespace(**{name: read[name].item() for name in read.dtype.names})
+    record = np.fromfile(path, HEADER, 1)[0]
+    header = SimpleNamespace(**{name: record[name].item() for name in record.dtype.names})
     if header.identifier not in (7, 8):
         raise ValueError(
             f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "

@@ -140,10 +140,10 @@ class MisreadWind(Blown):
         self.gain, self.cutoff = gain, 2.0 * math.pi * turbine.filter_frequency
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
-        read = exogenous[..., 0]
-        true = read / self.gain
+        reading = exogenous[..., 0]
+        true = reading / self.gain
         field = self.base.vector_field(t, state, action, replaced(exogenous, 0, true), closure)
-        return replaced(field, 2, field[..., 2] + self.cutoff * (read - true))
+        return replaced(field, 2, field[..., 2] + self.cutoff * (reading - true))
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> State:
         """The filtered wind speed starts at what the anemometer reads of the mean wind."""
@@ -152,8 +152,8 @@ class MisreadWind(Blown):
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Inputs:
         """What the anemometer reads, which is never below its least reading, and the lidar with the same gain."""
-        read = self.gain * self.base.draw_exogenous(batch, generator)
-        return read.clamp(min=self.inputs[0].low)
+        readings = self.gain * self.base.draw_exogenous(batch, generator)
+        return readings.clamp(min=self.inputs[0].low)
 
 
 class SwayingTower(Blown):

@@ -172,7 +172,7 @@ class Minimum(NamedTuple):
     gradient: np.ndarray
 
 
-class _Seen:
+class _Objective:
     """The function that L-BFGS-B calls; it remembers the best point."""
 
     def __init__(self, evaluate: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray):
@@ -218,10 +218,10 @@ def descend(
     """
     from scipy.optimize import fmin_l_bfgs_b  # here, because it takes a second to load and --help need not wait for it
 
-    seen = _Seen(evaluate, start)
+    objective = _Objective(evaluate, start)
     with _libraries().limit(limits=1, user_api="blas"):
         fmin_l_bfgs_b(  # ``minimize`` converts the bounds two times more, in a tenth of a solve of a short window
-            seen,
+            objective,
             start.ravel(),
             bounds=[(0.0, 1.0)] * start.size,
             m=PAIRS,
@@ -230,7 +230,7 @@ def descend(
             maxiter=iterations,
             maxfun=2 * iterations + 20,
         )
-    return seen.best
+    return objective.best
 
 
 @functools.cache

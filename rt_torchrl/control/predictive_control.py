@@ -194,12 +194,12 @@ class RecedingHorizon:
         state, states, actions = initial_state, [initial_state.unsqueeze(1)], []
         for k in range(0, exogenous.shape[1], self.period):
             t, inputs = k * self.plant.dt, exogenous[:, k : k + self.period]
-            read = state[:, : len(self.plant.states)]  # the system may have more than the model knows
-            command = self.plan(t, read, exogenous[:, k])[:, : inputs.shape[1]]
-            flown = system(state, inputs, command, start=t)
-            states.append(flown.states[:, 1:])
-            actions.append(flown.actions)
-            state = flown.states[:, -1]
+            measured = state[:, : len(self.plant.states)]  # the system may have more than the model knows
+            command = self.plan(t, measured, exogenous[:, k])[:, : inputs.shape[1]]
+            flight = system(state, inputs, command, start=t)
+            states.append(flight.states[:, 1:])
+            actions.append(flight.actions)
+            state = flight.states[:, -1]
         return Trajectory(torch.cat(states, 1), torch.cat(actions, 1), exogenous)
 
 

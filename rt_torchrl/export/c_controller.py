@@ -80,11 +80,11 @@ class CController:
         calls = {}
         for part, (function, example) in self.parts.items():
             head = c_file.add_function(source, f"{name}_{part}", function, example, places, kind="static void")
-            given = {"memory": "0", "last": "0", "next": "state->memory"}  # 0 where there is no such array
-            given |= {array: f"state->{array}" for array in self.arrays}
-            given["t"] = f"{dt} * (double)(state->steps - 1)" if part == "advance" else f"{dt} * (double)state->steps"
+            terms = {"memory": "0", "last": "0", "next": "state->memory"}  # 0 where there is no such array
+            terms |= {array: f"state->{array}" for array in self.arrays}
+            terms["t"] = f"{dt} * (double)(state->steps - 1)" if part == "advance" else f"{dt} * (double)state->steps"
             arguments = re.findall(r"(\w+)(?=[,)])", head)
-            calls[part] = f"{name}_{part}({', '.join(given.get(word, word) for word in arguments)});"
+            calls[part] = f"{name}_{part}({', '.join(terms.get(word, word) for word in arguments)});"
         last = [f"state->last[{k}] = measured[{k}];" for k in range(len(self.signals))]
         rest = [f"state->command[{k}] = 0.0;" for k in range(self.arrays["command"])]
         held = bool(self.controller.held)
@@ -206,12 +206,12 @@ def _traced(controller: Controller) -> dict[str, tuple[c_file.TracedFunction, di
         return parts
     parts["start"] = c_file.traced(what, start, {"measured": measured}), {"measured": measured}
     with torch.no_grad():
-        given = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
-        given["measured"] = measured
+        example = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
+        example["measured"] = measured
         controller.closure = unknown = UnknownClosure(plant.closure)
         try:
-            advance(**given)
-            parts["advance"] = c_file.traced(what, advance, given, prepare=unknown.begin), given
+            advance(**example)
+            parts["advance"] = c_file.traced(what, advance, example, prepare=unknown.begin), example
         finally:
             controller.closure = plant.closure
     if parts["advance"][0].reads("closure"):

@@ -67,16 +67,16 @@ def traced(
         UntraceableError: if the function cannot become a program; the message names the reason and the line.
     """
     tracer, entered = new_tracer(), list[str]()
-    given = {name: value.clone() for name, value in arguments.items()}
+    inputs = {name: value.clone() for name, value in arguments.items()}
     try:
-        for name, value in given.items():
+        for name, value in inputs.items():
             tracer.input(value, name)
         for weight in [] if module is None else module.parameters():
             tracer.weight(weight)
         if prepare is not None:
             prepare(tracer)
         with torch.no_grad(), tracer.following(), _noted(module, entered):
-            results = function(**given)
+            results = function(**inputs)
         outputs = {name: tracer.outputs(value) for name, value in results.items()}
     except UntraceableError as error:
         layer = f"layer {entered[-1]} of " if entered else ""

@@ -119,8 +119,8 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
     path, plant, closure = c_file.require_names(path, name), frozen(plant), frozen(closure)
     points, ends = _flights(plant, closure)
 
-    def step(**given: Tensor) -> dict[str, Tensor]:
-        return {"next": plant.step(**given, closure=closure).state}
+    def step(**point: Tensor) -> dict[str, Tensor]:
+        return {"next": plant.step(**point, closure=closure).state}
 
     def rest(read: Tensor) -> dict[str, Tensor]:
         return {"state": plant.at_rest(read)}
@@ -131,17 +131,17 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
         functions[f"{name}_rest"] = (rest, {"read": read}, plant.at_rest(read).detach())
     source = c_file.source_of("closure", closure)
     heads = []
-    for called, (function, given, _) in functions.items():
-        example = {argument: x[:1] for argument, x in given.items()}
+    for called, (function, inputs, _) in functions.items():
+        example = {argument: x[:1] for argument, x in inputs.items()}
         part = c_file.traced(f"the twin of plant {plant.name!r}", function, example, closure)
         heads.append(c_file.add_function(source, called, part, example))
 
     def compare(library: ctypes.CDLL) -> float:
         errors = []
-        for called, (_, given, expected) in functions.items():
-            values = c_file.answers(getattr(library, called), given, len(plant.states))
+        for called, (_, inputs, expected) in functions.items():
+            values = c_file.answers(getattr(library, called), inputs, len(plant.states))
             rows = [
-                dict(zip(given, row, strict=True)) for row in zip(*(x.tolist() for x in given.values()), strict=True)
+                dict(zip(inputs, row, strict=True)) for row in zip(*(x.tolist() for x in inputs.values()), strict=True)
             ]
             what = f"{called} in C"
             errors.append(require_close(values, expected, sizes(expected), TOLERANCE, plant.states, what, rows))

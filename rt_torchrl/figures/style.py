@@ -101,10 +101,10 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def save_pixels(drawn: np.ndarray, path: Path) -> None:
+def save_pixels(image: np.ndarray, path: Path) -> None:
     """Write what ``pixels`` gave as PNG, whole or not at all."""
     file = io.BytesIO()
-    imsave(file, drawn, format="png", dpi=120)
+    imsave(file, image, format="png", dpi=120)
     write_atomically(path, file.getvalue())
 
 

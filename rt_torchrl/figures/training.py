@@ -244,9 +244,9 @@ def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
 
 
 def _curves(snapshot: Snapshot) -> Figure:
-    plant, seen = snapshot.plant, visited_observations(snapshot)
+    plant, observations = snapshot.plant, visited_observations(snapshot)
     # The axis has errors of both signs, so that it shows the target.
-    axis = _axis(plant.observations[0], torch.cat([seen[:, 0], -seen[:, 0]]))
+    axis = _axis(plant.observations[0], torch.cat([observations[:, 0], -observations[:, 0]]))
     figure, axes = style.grid(
         len(plant.actions),
         title=f"Policies after episode {style.last_episode(snapshot)}",
@@ -257,7 +257,7 @@ def _curves(snapshot: Snapshot) -> Figure:
         values = array(snapshot.policies[role](axis[:, None]))
         for k, ax in enumerate(axes):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
-    visited = array(_some(seen[:, 0]))
+    visited = array(_some(observations[:, 0]))
     for ax, action in zip(axes, plant.actions, strict=True):
         style.limits(ax, action)
         ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
@@ -304,8 +304,8 @@ def contours(
         planes: two axes, for the model-based and the model-free policy, for each pair of observations by index.
         others: values of the observations that are not in the pair.
     """
-    signals, seen = snapshot.plant.observations, visited_observations(snapshot)
-    grids = {plane: [_axis(signals[i], seen[:, i]) for i in plane] for plane in planes}
+    signals, visited = snapshot.plant.observations, visited_observations(snapshot)
+    grids = {plane: [_axis(signals[i], visited[:, i]) for i in plane] for plane in planes}
     fields = {}
     for plane, grid in grids.items():
         points = others.expand(RESOLUTION**2, -1).clone()
@@ -321,7 +321,7 @@ def contours(
             else:
                 place: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center", "fontsize": 9}
                 ax.text(0.5, 0.5, "plans its actions:\nno function of the observation", **place)
-            ax.scatter(*array(_some(seen[:, plane])).T, label="visited in the last episode", **DOTS)
+            ax.scatter(*array(_some(visited[:, plane])).T, label="visited in the last episode", **DOTS)
             caption(ax, role_name(role), "live" if role == snapshot.live else "idle")
             ax.set_xlabel(signals[plane[0]].label)
             ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -335,21 +335,21 @@ def functions_of_observation(snapshot: Snapshot) -> list[Role]:
     return [role for role in ROLES if not isinstance(snapshot.policies[role], StateFeedback)]
 
 
-def _some(seen: Tensor) -> Tensor:
+def _some(visited: Tensor) -> Tensor:
     """As many of the visited observations as are shown."""
-    return seen[:: -(-len(seen) // SHOWN)]
+    return visited[:: -(-len(visited) // SHOWN)]
 
 
-def _axis(signal: Signal, seen: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
+def _axis(signal: Signal, visited: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
     """Points over the declared range and the visited values of a signal, so that no dot lies outside.
 
     At an end that is not declared there is a margin beyond the visited values.
     """
-    least, greatest = seen.min().item(), seen.max().item()
+    least, greatest = visited.min().item(), visited.max().item()
     margin = 0.05 * (greatest - least) or 1.0
     low = min(signal.low, least) if math.isfinite(signal.low) else least - margin
     high = max(signal.high, greatest) if math.isfinite(signal.high) else greatest + margin
-    return torch.linspace(low, high, RESOLUTION, dtype=seen.dtype, device=seen.device)
+    return torch.linspace(low, high, RESOLUTION, dtype=visited.dtype, device=visited.device)
 
 
 def _levels(fields: list[Float[np.ndarray, "m m"]]) -> Float[np.ndarray, " levels"]:

@@ -22,8 +22,8 @@ def twin_and_sensors(identified: Identified) -> Figure:
     figure, axes = style.grid(len(sensors), title="Twin and sensors", size=size, xlabel=f"time [{unit}]")
     parts = ((training, identified.training[1]), (held_out, identified.held_out[1]))
     for k, (ax, sensor) in enumerate(zip(axes, sensors, strict=True)):
-        read = np.concatenate([array(record.readings[:, k]) for record in (*training, *held_out)])
-        margin = 0.1 * (np.nanmax(read) - np.nanmin(read)) or 1.0
+        readings = np.concatenate([array(record.readings[:, k]) for record in (*training, *held_out)])
+        margin = 0.1 * (np.nanmax(readings) - np.nanmin(readings)) or 1.0
         for records, judgement in parts:
             for record, replayed in zip(records, judgement.readings, strict=True):
                 t = (record.start + dt * np.arange(len(record.readings))) / length
@@ -33,7 +33,7 @@ def twin_and_sensors(identified: Identified) -> Figure:
             ends = record.start, record.start + dt * len(record.actions)
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
         # A twin that is far off must not flatten what was read.
-        ax.set_ylim(np.nanmin(read) - margin, np.nanmax(read) + margin)
+        ax.set_ylim(np.nanmin(readings) - margin, np.nanmax(readings) + margin)
         before, after = (style.with_unit(fit.rms[k].item(), sensor.measurement.unit) for fit in identified.held_out)
         caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
     legend_below(figure, axes)

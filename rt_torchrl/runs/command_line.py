@@ -105,16 +105,16 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
         default = tyro.MISSING_NONPROP
     if not helped:
         return tyro.cli(config_class, args=rest, default=default)
-    parts = ConstructorRegistry()
+    registry = ConstructorRegistry()
 
-    @parts.struct_rule
+    @registry.struct_rule
     def hidden(info: StructTypeInfo) -> StructConstructorSpec | None:
         if HELP_ALL in words or info.type is config_class or not dataclasses.is_dataclass(info.type):
             return None
         return StructConstructorSpec(instantiate=lambda: info.default, fields=())
 
     with contextlib.suppress(SystemExit):
-        tyro.cli(config_class, args=["--help"], default=default, registry=parts)
+        tyro.cli(config_class, args=["--help"], default=default, registry=registry)
     if HELP_ALL not in words:
         print(MORE)
     raise SystemExit(0)
@@ -153,8 +153,8 @@ def of_file(path: Path, config: RunConfig) -> RunConfig:
         raise ValueError(f"{path} is of the recipe {Path(source).name}, not of {Path(file).name}; use its recipe.")
     options = {name: value for name, value in settings.items() if name not in (*BESIDE, *OF_THE_CALL)}
     try:
-        read = read_options(type(config), _over(as_written(config.defaults()), options))
-        return dataclasses.replace(read, config=None, log_dir=None)
+        stored = read_options(type(config), _over(as_written(config.defaults()), options))
+        return dataclasses.replace(stored, config=None, log_dir=None)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -206,14 +206,14 @@ def plant_class(name: str) -> type[Plant]:
     Raises:
         ValueError: if there is no such plant.
     """
-    known = shipped_plants()
+    plants = shipped_plants()
     if ":" not in name:
-        if name not in known:
+        if name not in plants:
             raise ValueError(
-                f"plant={name!r} does not exist; choose one of {', '.join(known)}, or name one of your own as "
+                f"plant={name!r} does not exist; choose one of {', '.join(plants)}, or name one of your own as "
                 "FILE.py:NAME or package.module:NAME."
             )
-        return known[name]
+        return plants[name]
     kind = named(name)
     if not (inspect.isclass(kind) and issubclass(kind, Plant)):
         raise ValueError(f"plant={name!r} is no class derived from Plant.")

@@ -352,19 +352,19 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
 
     from rt_torchrl.figures.style import legend_below, panels
 
-    drawn = [(comparison, rows) for comparison in comparisons for rows in comparison.tasks()]
+    groups = [(comparison, rows) for comparison in comparisons for rows in comparison.tasks()]
     names = list(dict.fromkeys(row.name for comparison in comparisons for row in comparison.rows))
-    columns = 2 if len(drawn) == 4 else min(3, len(drawn))
-    size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(drawn) // columns))
-    figure, axes = panels(-(-len(drawn) // columns), columns, title=title, size=size)
-    for ax in axes.flat[len(drawn) :]:
+    columns = 2 if len(groups) == 4 else min(3, len(groups))
+    size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(groups) // columns))
+    figure, axes = panels(-(-len(groups) // columns), columns, title=title, size=size)
+    for ax in axes.flat[len(groups) :]:
         ax.remove()
-    for ax, (comparison, rows) in zip(axes.flat, drawn, strict=False):
+    for ax, (comparison, rows) in zip(axes.flat, groups, strict=False):
         whole = len(comparison.tasks()) == 1
         _panel(ax, rows, names, comparison.title if whole else f"{comparison.title}, {rows[0].name}")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_xlabel("real episodes")
-    legend_below(figure, list(axes.flat[: len(drawn)]))
+    legend_below(figure, list(axes.flat[: len(groups)]))
     return figure
 
 

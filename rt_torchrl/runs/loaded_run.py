@@ -325,18 +325,18 @@ def _read_weights(folder: Path) -> dict[str, dict[str, Any]]:
     return load_tensors(file)
 
 
-def _start(plant: Plant, given: Tensor, count: int) -> Tensor:
+def _start(plant: Plant, states: Tensor, count: int) -> Tensor:
     """Given initial states, of which the unread ones may be left out."""
-    if given.shape[-1:] == (len(plant.readings),):
-        return plant.at_rest(_rows(given, "initial_state", count, (len(plant.readings),)))
-    return _rows(given, "initial_state", count, (len(plant.states),))
+    if states.shape[-1:] == (len(plant.readings),):
+        return plant.at_rest(_rows(states, "initial_state", count, (len(plant.readings),)))
+    return _rows(states, "initial_state", count, (len(plant.states),))
 
 
-def _rows(given: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:
+def _rows(values: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:
     """A tensor in double precision with a batch dimension of ``count``."""
-    if tuple(given.shape[-len(shape) :]) != shape or given.dim() - len(shape) not in (0, 1):
-        raise ValueError(f"{name} of shape {tuple(given.shape)} must have the shape {shape}, or a batch of it.")
-    rows = given.to(torch.float64).reshape(-1, *shape)
+    if tuple(values.shape[-len(shape) :]) != shape or values.dim() - len(shape) not in (0, 1):
+        raise ValueError(f"{name} of shape {tuple(values.shape)} must have the shape {shape}, or a batch of it.")
+    rows = values.to(torch.float64).reshape(-1, *shape)
     if len(rows) not in (1, count):
         raise ValueError(f"{name} has {len(rows)} episodes, others {count}; give as many of each, or one.")
     return rows.expand(count, *shape).contiguous()

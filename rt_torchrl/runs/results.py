@@ -380,10 +380,10 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | Non
     columns |= {"true": true} if true else {}
     lines = [f"  {'closure weight':<22}" + "".join(f"{column:>12}" for column in columns)]
     for name in weights:
-        about = closure["described"].get(name, {"unit": "", "meaning": ""})
-        label = f"{name} [{about['unit']}]" if about["unit"] else name
+        description = closure["described"].get(name, {"unit": "", "meaning": ""})
+        label = f"{name} [{description['unit']}]" if description["unit"] else name
         cells = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
-        lines.append(f"  {label:<22}{cells}   {about['meaning']}".rstrip())
+        lines.append(f"  {label:<22}{cells}   {description['meaning']}".rstrip())
     return lines
 
 
@@ -410,9 +410,9 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     if not watched:
         return []
     raised = sum(record["alarm"] > 0.0 for record in watched)
-    about = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
+    text = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
     last = [f"  episode {record['episode']}: {record['warning']}" for record in watched if record.get("warning")][-1:]
-    return [f"  {about}", *last]
+    return [f"  {text}", *last]
 
 
 def dearer_than_first(summary: Mapping[str, Any]) -> str:

@@ -178,18 +178,18 @@ def known_physics(
     believed = config.believed()
     physics = plant if believed is None else believed
     require_plant("config.believed()", physics)
-    known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
-    if known != read:
+    modelled, sensed = ([state.name for state in states] for states in (physics.states, plant.readings))
+    if modelled != sensed:
         raise ValueError(
-            f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
-            f"{', '.join(read)}, which is all that sensors read; let believed() of the Config give the plant without "
+            f"a twin of plant {plant.name!r} with the states {', '.join(modelled)} cannot be fitted to records of "
+            f"{', '.join(sensed)}, which is all that sensors read; let believed() of the Config give the plant without "
             "its extensions."
         )
     for model in filter(None, (plant, believed)):
         check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics)
-    given: dict[str, object] = {} if first is None else {"first": first}
-    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
-    for name, law in given.items():
+    controllers: dict[str, object] = {} if first is None else {"first": first}
+    controllers |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
+    for name, law in controllers.items():
         if not _acts_on_the_real_system(law):
             require_controller(name, law, physics)
     return physics
