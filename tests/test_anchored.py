@@ -46,7 +46,7 @@ def replays_on(plant, records, inputs, costs, policy, closure=None):
 
 def anchored_costs(replays, policy):
     """J_a that the anchored replays say of a policy."""
-    alone = replays.twin.episode_costs(policy, replays.twin.plant.at_rest(replays.read), replays.inputs)
+    alone = replays.twin.episode_costs(policy, replays.twin.plant.at_rest(replays.starts), replays.inputs)
     return (alone * replays.corrections(policy).exp()).detach()
 
 
@@ -80,7 +80,7 @@ def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
         plant = list(physics.suspects().values())[-1]
         closure = plant.extended(closure)
     replays = replays_on(plant, records, inputs, costs, policy, closure)
-    alone = replays.twin.episode_costs(policy, replays.twin.plant.at_rest(replays.read), inputs).detach()
+    alone = replays.twin.episode_costs(policy, replays.twin.plant.at_rest(replays.starts), inputs).detach()
     assert anchored_costs(replays, policy).tolist() == pytest.approx(costs.tolist(), rel=1e-9)
     assert (alone / costs - 1.0).abs().max() > 1e-4
     assert torch.equal(replays.flown[0], replays.actions(policy)) and replays.explored.tolist() == [0.0, 0.0]
@@ -122,7 +122,7 @@ def test_an_unread_force_on_a_linear_plant_is_replayed_exactly_under_any_policy(
     starts = real.draw_initial_state(2, torch.Generator().manual_seed(0))
     true = Rollout(real, real.closure, other).costs(starts, inputs).tolist()
     assert anchored_costs(replays, other).tolist() == pytest.approx(true, rel=1e-9)
-    alone = replays.twin.episode_costs(other, replays.read, inputs).tolist()
+    alone = replays.twin.episode_costs(other, replays.starts, inputs).tolist()
     assert alone != pytest.approx(true, rel=0.1)
 
 
@@ -305,7 +305,7 @@ def test_an_episode_on_which_the_twin_nearly_diverges_or_does_is_left_out(gain):
     before = belief.correction(LinearGain([[0.55, 0.5]])).item()
     wild = belief.flown[0]._replace(weights={"gain": torch.tensor([[gain, 0.0]]).double()})
     belief.append(wild.trajectory, "model_based", wild.cost, weights=wild.weights)
-    assert abs(belief.differences()[-1]) == 5.0 and len(belief.anchors().replays.read) == 2
+    assert abs(belief.differences()[-1]) == 5.0 and len(belief.anchors().replays.starts) == 2
     assert belief.correction(LinearGain([[0.55, 0.5]])).item() == pytest.approx(before, rel=1e-9)
 
 
@@ -363,7 +363,7 @@ def test_the_latest_whole_episodes_are_replayed_and_again_where_the_twin_has_cha
     part = belief.flown[-1].trajectory.part(0, 10, physics.dt)
     belief.append(part, "model_based", 1.0)
     anchors, policy = belief.anchors(), LinearGain([[0.52, 0.5]])
-    assert len(anchors.replays.read) == ANCHORS + 2 and belief.anchors() is anchors
+    assert len(anchors.replays.starts) == ANCHORS + 2 and belief.anchors() is anchors
     few = anchors.replays.latest(ANCHORS)
     assert torch.equal(few.corrections(policy), anchors.replays.corrections(policy)[2:])
     assert belief.correction(policy, latest=ANCHORS) != belief.correction(policy)

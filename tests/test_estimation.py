@@ -137,11 +137,11 @@ def test_the_example_of_the_documentation_runs():
     (code,) = blocks("identify.md", "python")
     names = {}
     exec(code, names)
-    found, plant = names["found"], names["plant"]
-    assert found.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
+    estimate, plant = names["estimate"], names["plant"]
+    assert estimate.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
     true = plant.closure.named_coefficients()
     for name in ("lower_outlet", "lower_loss", "upper_outlet"):
-        assert found.after[name] == pytest.approx(true[name].item(), rel=1e-3)
+        assert estimate.after[name] == pytest.approx(true[name].item(), rel=1e-3)
 
 
 def test_parts_of_a_record_share_no_sample():

@@ -143,11 +143,11 @@ def _along(x: Tensor, direction: Tensor, measure: Callable[[], Tensor]) -> Tenso
 
     They differ where a law has a corner, such as that of a rate limit.
     """
-    kept, ends = x.clone(), []
+    value, ends = x.clone(), []
     for sign in (1.0, 0.0, -1.0):
-        x.copy_(kept + sign * STEP * direction)
+        x.copy_(value + sign * STEP * direction)
         ends.append(measure())
-    x.copy_(kept)
+    x.copy_(value)
     return torch.stack([ends[0] - ends[1], ends[1] - ends[2]]) / STEP
 
 

@@ -216,8 +216,8 @@ def judgement(calls: Calls) -> Iterator[str]:
                     f"intervals; expected {numbers_of((batch, steps))}."
                 )
     for key, value in calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]).items():
-        known = value.nan_to_num() if isinstance(value, Tensor) else value  # which not every episode has
-        if problem := misshapen(known, (batch,)):
+        numbers = value.nan_to_num() if isinstance(value, Tensor) else value  # which not every episode has
+        if problem := misshapen(numbers, (batch,)):
             yield f"merit: {key!r} has {problem} for {batch} episodes; expected shape ({batch},) in torch.float64."
 
 

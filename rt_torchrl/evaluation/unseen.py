@@ -181,15 +181,15 @@ class UnseenEpisodes:
         flown = flown.segments(segment, physics.dt) if segment else flown
         measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
 
-        def costs(some: Trajectory) -> Costs:
+        def costs(batch: Trajectory) -> Costs:
             try:
-                replayed = rollout(some.states[:, 0], some.exogenous, some.actions, start=some.start)
+                replayed = rollout(batch.states[:, 0], batch.exogenous, batch.actions, start=batch.start)
             except DivergenceError:
-                if len(some.states) == 1:
-                    return some.states.new_full((1,), torch.inf)
-                rows = torch.arange(len(some.states), device=some.states.device).split(1)
-                return torch.cat([costs(some.rows(row)) for row in rows])
-            return identification_cost(physics, replayed, some.states)
+                if len(batch.states) == 1:
+                    return batch.states.new_full((1,), torch.inf)
+                rows = torch.arange(len(batch.states), device=batch.states.device).split(1)
+                return torch.cat([costs(batch.rows(row)) for row in rows])
+            return identification_cost(physics, replayed, batch.states)
 
         return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
 

@@ -319,9 +319,9 @@ class Estimation:
         prior = WeightPrior(closure, config.prior)
 
         def descend(number: int) -> Minimum:
-            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if number else 0
+            steps = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if number else 0
             minimum = self._descended(self.likelihood(records, prior=prior))
-            return minimum._replace(iterations=done + minimum.iterations)
+            return minimum._replace(iterations=steps + minimum.iterations)
 
         minimum = multi_start(closure, config.starts, descend)
         iterations = minimum.iterations
@@ -336,20 +336,20 @@ class Estimation:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         scatter = scatter_of(self.sensors, records)
         floor = scatter.new_tensor([DEPARTURE * (sensor.noise or 0.0) for sensor in self.sensors])
-        lengths, done = [len(record.actions) for record in records], 0
+        lengths, steps = [len(record.actions) for record in records], 0
         free, samples = int((self.spread > 0.0).sum()), sum(int(record.seen.sum()) for record in records)
 
         def fit(length: int) -> tuple[Minimum, Tensor]:
-            nonlocal done
+            nonlocal steps
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
             minimum = self._minimum(records, length)
-            done += minimum.iterations
+            steps += minimum.iterations
             return minimum, judged(minimum.likelihood).rms
 
         enough = torch.maximum(EXPLAINED * scatter, floor)
         minimum = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
-        return minimum._replace(iterations=done)
+        return minimum._replace(iterations=steps)
 
     def unstable(self, records: Sequence[SensorRecord]) -> bool:
         """Whether errors of the first states grow by more than a factor of 1000 along the records.
@@ -441,11 +441,11 @@ def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Fl
     readings = torch.cat([record.readings for record in records])
     scatter = []
     for sensor, values in zip(sensors, readings.T, strict=True):
-        seen = values[~values.isnan()]
-        if not len(seen):
+        samples = values[~values.isnan()]
+        if not len(samples):
             raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
-        origin = seen[:1].expand_as(seen)
-        change = differences([sensor.measurement], seen[:, None], origin[:, None])
+        origin = samples[:1].expand_as(samples)
+        change = differences([sensor.measurement], samples[:, None], origin[:, None])
         scatter.append(change.square().mean().sqrt())
     return torch.stack(scatter)
 

@@ -298,7 +298,7 @@ def _read_csv(path: Path) -> Any:
                 )
     frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
     # pandas gives a name to a column without one, and another name to a header that is there twice.
-    frame.columns = [header or given for header, given in zip(headers, frame, strict=True)]
+    frame.columns = [header or name for header, name in zip(headers, frame, strict=True)]
     return frame
 
 

@@ -219,10 +219,10 @@ def filled(log: SensorLog, plant: Plant, guesses: Mapping[str, float] | None = N
             )
     columns = {}
     for name, values in log.columns.items():
-        seen = np.isfinite(values)
-        if not seen.any():
+        finite = np.isfinite(values)
+        if not finite.any():
             raise ValueError(f"column {name!r} of the log holds no number; leave it out.")
-        columns[name] = values if seen.all() else np.interp(log.times, log.times[seen], values[seen])
+        columns[name] = values if finite.all() else np.interp(log.times, log.times[finite], values[finite])
     if hidden:
         drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0)).mean(0)
         usual = dict(zip((state.name for state in plant.states), drawn.tolist(), strict=True))
@@ -273,8 +273,8 @@ def _around(log: SensorLog, grid: Samples) -> slice:
 
 
 def _samples(signal: Signal, times: Rows, values: Rows, grid: Samples, gap: float) -> Samples:
-    seen = np.isfinite(values)
-    times, values = times[seen], values[seen]
+    finite = np.isfinite(values)
+    times, values = times[finite], values[finite]
     if len(times) < 2:
         return np.full(len(grid), np.nan)
     values = _unwrapped(signal, values)

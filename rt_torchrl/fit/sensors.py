@@ -174,10 +174,10 @@ class SensorRecord(NamedTuple):
 
         Its first state is guessed by the course, or else by the record's own guess.
         """
-        held, samples = slice(first, last), slice(first, last + 1)
+        steps, samples = slice(first, last), slice(first, last + 1)
         course = None if self.course is None else self.course[samples]
         guess, start = self.guess if course is None else course[0], self.start + first * dt
-        return SensorRecord(self.readings[samples], self.actions[held], self.exogenous[held], guess, start, course)
+        return SensorRecord(self.readings[samples], self.actions[steps], self.exogenous[steps], guess, start, course)
 
 
 def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -> SensorRecord:

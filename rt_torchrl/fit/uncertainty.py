@@ -126,9 +126,9 @@ class Uncertainty:
         """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
         initial, n = self.likelihood.initial, self.likelihood.weight_count
         shape = initial.offsets.shape
-        held = slice(n, n + shape.numel())
-        variance = self.covariance.diagonal()[held].clone()
-        axes = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
+        places = slice(n, n + shape.numel())
+        variance = self.covariance.diagonal()[places].clone()
+        axes = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[places]
         variance[self._inverse.unknown(axes)] = math.inf
         errors = torch.zeros_like(initial.guess)
         errors[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
@@ -144,9 +144,9 @@ class Uncertainty:
         R = self.correlations()
         for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():
             if not {self.names[i], self.names[j]} & set(nothing):
-                kept = "ratio" if R[i, j] > 0.0 else "product"
+                kind = "ratio" if R[i, j] > 0.0 else "product"
                 warnings.append(
-                    f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kept}, better "
+                    f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kind}, better "
                     f"than each of them (correlation {R[i, j].item():.4f})"
                 )
         return warnings
@@ -214,14 +214,14 @@ class InverseInformation(NamedTuple):
 def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
     """The inverse of an information matrix in the directions that it shows."""
     diagonal = H.diagonal()
-    seen = diagonal > 0.0
-    unit = diagonal[seen].sqrt()
-    values, vectors = torch.linalg.eigh(H[seen][:, seen] / unit / unit[:, None])
+    informed = diagonal > 0.0
+    unit = diagonal[informed].sqrt()
+    values, vectors = torch.linalg.eigh(H[informed][:, informed] / unit / unit[:, None])
     significant = values > LEAST_EIGENVALUE
     identity = torch.eye(len(H), dtype=H.dtype, device=H.device)
-    directions = identity[:, seen] @ (vectors / unit[:, None])
+    directions = identity[:, informed] @ (vectors / unit[:, None])
     root = directions[:, significant] / values[significant].sqrt()
-    return InverseInformation(root, torch.cat([directions[:, ~significant], identity[:, ~seen]], -1), ~seen)
+    return InverseInformation(root, torch.cat([directions[:, ~significant], identity[:, ~informed]], -1), ~informed)
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:

@@ -89,12 +89,12 @@ class LaggedActuator(Actuator):
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         steps = self.dt * self.stages / self.coefficients(closure)[0]
-        left = torch.exp(-steps)
-        share = (1.0 - left) / steps
+        decay = torch.exp(-steps)
+        share = (1.0 - decay) / steps
         mean, ends = applied[..., self.place], []
         for x in hidden.unbind(-1):
             off = x - mean
-            ends.append(mean + off * left)
+            ends.append(mean + off * decay)
             mean = mean + off * share
         return replaced(applied, self.place, mean), torch.stack(ends, -1)
 
@@ -141,8 +141,8 @@ class ResonantActuator(Actuator):
         omega, odds = self.coefficients(closure).unbind()
         zeta = odds / (1.0 + odds)
         decay, ringing = zeta * omega, omega * torch.sqrt(1.0 - zeta * zeta)
-        left, turn = torch.exp(-decay * self.dt), ringing * self.dt
-        cosine, sine = left * torch.cos(turn), left * torch.sin(turn) / ringing
+        envelope, turn = torch.exp(-decay * self.dt), ringing * self.dt
+        cosine, sine = envelope * torch.cos(turn), envelope * torch.sin(turn) / ringing
         off = x - demand
         end = off * (cosine + decay * sine) + v * sine
         rate = v * (cosine - decay * sine) - omega * omega * off * sine

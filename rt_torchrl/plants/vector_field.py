@@ -99,13 +99,13 @@ class NeuralResidual(Extension):
         seed: int = 0,
     ):
         bounds = _bounds(base, greatest)
-        signals, given = _signals(base, inputs), dict(ranges or {})
-        spare = [name for name in given if name not in inputs]
+        signals, limits = _signals(base, inputs), dict(ranges or {})
+        spare = [name for name in limits if name not in inputs]
         if spare:
             raise ValueError(f"ranges: {quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
         scaled: list[Range] = []
         for name, (_, signal) in zip(inputs, signals, strict=True):
-            scaled += _scaled(signal, given.get(name))
+            scaled += _scaled(signal, limits.get(name))
         network = ResidualRates(scaled, bounds, hidden=hidden, generator=torch.Generator().manual_seed(seed))
         super().__init__(base, [], network)
         self._whole = not base.own_scheme
@@ -173,11 +173,11 @@ def _signals(base: Plant, inputs: Sequence[str]) -> list[tuple[int, Signal]]:
     return [known[name] for name in inputs]
 
 
-def _scaled(signal: Signal, given: Range | None) -> list[Range]:
+def _scaled(signal: Signal, limits: Range | None) -> list[Range]:
     """Ranges of the features that a signal becomes."""
     if signal.periodic:
         return [(-1.0, 1.0), (-1.0, 1.0)]
-    low, high = given or (signal.low, signal.high)
+    low, high = limits or (signal.low, signal.high)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(
             f"{signal.name!r} of the residual goes from {low} to {high} {signal.unit}; give "

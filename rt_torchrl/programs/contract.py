@@ -179,29 +179,29 @@ class Holdings(Compared):
             return self._read_numbers(x)
         if isinstance(x, np.ndarray):
             self._complete = False
-            held = x.flatten().tolist()
+            contents = x.flatten().tolist()
         elif isinstance(x, contextvars.ContextVar):
             self._complete = False
-            held = [x.get(None)]
+            contents = [x.get(None)]
         elif isinstance(x, MAPPINGS):
             self.mappings.append(x)
-            held = [*x, *x.values()]
+            contents = [*x, *x.values()]
         else:
             self.sequences += [x] if isinstance(x, SEQUENCES) else []
-            held = [*x] if isinstance(x, (*SEQUENCES, tuple, frozenset)) else []
+            contents = [*x] if isinstance(x, (*SEQUENCES, tuple, frozenset)) else []
         for name in _parts_of(x):
             try:
-                held.append(getattr(x, name))
+                contents.append(getattr(x, name))
                 self.parts.append((x, name))
             except (AttributeError, ValueError):  # a slot or a variable without a value, which may get one
                 self._complete = False
         if hasattr(x, "__dict__"):
             self.instances += [x] if self._numbered[id(x)] else []  # all but the root
             self.mappings.append(vars(x))
-            held += [*vars(x), *vars(x).values()]
-        elif not held and not isinstance(x, (*MAPPINGS, *SEQUENCES, tuple, frozenset)):
+            contents += [*vars(x), *vars(x).values()]
+        elif not contents and not isinstance(x, (*MAPPINGS, *SEQUENCES, tuple, frozenset)):
             return self._address(x)
-        return [self._mention(type(x)), *map(self._mention, held)]
+        return [self._mention(type(x)), *map(self._mention, contents)]
 
     def _read_numbers(self, x: Any) -> list[object]:
         """Type and shape of a tensor or an array, and its numbers unless they are an input."""
@@ -219,8 +219,8 @@ class Holdings(Compared):
 
     def unchanged(self, root: nn.Module) -> bool:
         """Whether everything is as it was; a change that leaves the digest as it is may count as one."""
-        kind, held = self._of_root
-        return self._complete and not any(self._empty) and type(root) is kind and vars(root) is held and self.same()
+        kind, contents = self._of_root
+        return self._complete and not any(self._empty) and type(root) is kind and vars(root) is contents and self.same()
 
 
 _values = methodcaller("values")
@@ -255,9 +255,9 @@ class Outside(Compared):
         new = kind not in self._kinds
         if new:
             self._kinds.add(kind)
-            held = vars(kind)
-            self.classes.append(held)
-            self.entries += [(held, name) for name, value in held.items() if isinstance(value, WRAPPERS)]
+            attributes = vars(kind)
+            self.classes.append(attributes)
+            self.entries += [(attributes, name) for name, value in attributes.items() if isinstance(value, WRAPPERS)]
             self.parts.append((kind, "__mro__"))
         return new
 
@@ -283,15 +283,15 @@ class Executed:
                 before.enable()
 
     def _note(self, frame: types.FrameType, event: str, argument: object) -> None:
-        code, held = frame.f_code, frame.f_globals
-        if event == "call" and (code, id(held)) not in self.globals and not _of_library(code, held):
-            self.globals[code, id(held)] = held
+        code, namespace = frame.f_code, frame.f_globals
+        if event == "call" and (code, id(namespace)) not in self.globals and not _of_library(code, namespace):
+            self.globals[code, id(namespace)] = namespace
             if code.co_freevars:
                 self.variables[code] = {x: frame.f_locals[x] for x in code.co_freevars if x in frame.f_locals}
 
 
-def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
-    name = held.get("__name__")
+def _of_library(code: types.CodeType, namespace: dict[str, Any]) -> bool:
+    name = namespace.get("__name__")
     generated = name in FACTORIES or code.co_filename.startswith(GENERATED) or str(name).startswith("namedtuple_")
     return foreign(name) or generated
 
@@ -318,8 +318,8 @@ class _Reads:
                 if not foreign(kind.__module__) and self.outside.add_class(kind):
                     for value in vars(kind).values():
                         self._note_function(value)
-        for (code, _), held in executed.globals.items():
-            self._globals(code, held)
+        for (code, _), namespace in executed.globals.items():
+            self._globals(code, namespace)
         named = {name: code for code in self._codes for name in _names(code).attributes}
         for x in objects:
             self._class_attributes(x, named)
@@ -327,7 +327,7 @@ class _Reads:
             self._variables(code, executed.variables.get(code, {}))
         self.outside.note()
 
-    def _globals(self, code: types.CodeType, held: dict[str, Any]) -> None:
+    def _globals(self, code: types.CodeType, namespace: dict[str, Any]) -> None:
         names = _names(code)
         for module in names.imports:  # nothing notices what this module holds
             if not foreign(module):
@@ -335,8 +335,8 @@ class _Reads:
                     f"{_where(code)} imports {module!r} inside, whose values may change unnoticed; import it at the "
                     "top of the file"
                 )
-        for name in names.globals & held.keys():
-            self._take(code, held, name, "the global ")
+        for name in names.globals & namespace.keys():
+            self._take(code, namespace, name, "the global ")
 
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
@@ -349,8 +349,8 @@ class _Reads:
         followed = isinstance(value, (Tensor, np.ndarray)) and isinstance(holder, dict)  # by its numbers
         if not followed and not self._constant(value):
             raise _refusal(code, f"{prefix}{name}", value)
-        seen = (id(holder), name) in self._judged
-        if not seen:
+        judged = (id(holder), name) in self._judged
+        if not judged:
             self._judged.add((id(holder), name))
             self._note_function(value)
             if isinstance(holder, type):
@@ -360,7 +360,7 @@ class _Reads:
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
             for attribute in attributes & vars(further).keys():
-                if not (seen and (id(further), attribute) in self._judged):
+                if not (judged and (id(further), attribute) in self._judged):
                     self._take(code, further, attribute, f"{inner}.")
 
     def _class_attributes(self, x: object, named: dict[str, types.CodeType]) -> None:
@@ -431,13 +431,13 @@ class _Names(NamedTuple):
 @lru_cache(maxsize=2**14)
 def _names(code: types.CodeType) -> _Names:
     """Names of the globals, the attributes and the modules that code itself reads."""
-    read = collections.defaultdict[str, set[str]](set)
+    by_opcode = collections.defaultdict[str, set[str]](set)
     for instruction in dis.get_instructions(code):
-        read[instruction.opname].add(instruction.argval)
-    names = read["LOAD_GLOBAL"] | read["LOAD_NAME"]
+        by_opcode[instruction.opname].add(instruction.argval)
+    names = by_opcode["LOAD_GLOBAL"] | by_opcode["LOAD_NAME"]
     texts = {x for x in code.co_consts if isinstance(x, str)} if "getattr" in names else set()
-    attributes = texts.union(*(read[kind] for kind in ATTRIBUTES))
-    return _Names(frozenset(names), frozenset(attributes), frozenset(read["IMPORT_NAME"]))
+    attributes = texts.union(*(by_opcode[kind] for kind in ATTRIBUTES))
+    return _Names(frozenset(names), frozenset(attributes), frozenset(by_opcode["IMPORT_NAME"]))
 
 
 def _holders(value: object) -> Iterator[Any]:
@@ -487,14 +487,14 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
     """
     last = tree_map(lambda x: x[-1:], arguments)
     strided = {name: x for name, x in module.named_buffers() if x.layout is torch.strided}
-    kept = {name: x.clone() for name, x in strided.items()}
+    copies = {name: x.clone() for name, x in strided.items()}
     answers = _answers(module, arguments)
     module(*tree_map(lambda x: x[-1:].expand_as(x).clone(), arguments))
     again = _answers(module, arguments)
-    changed = [name for name, x in strided.items() if not torch.allclose(x, kept[name], 0, 0, equal_nan=True)]
+    changed = [name for name, x in strided.items() if not torch.allclose(x, copies[name], 0, 0, equal_nan=True)]
     with torch.no_grad():
         for name in changed:
-            strided[name].copy_(kept[name])
+            strided[name].copy_(copies[name])
     if changed:
         owner, _, buffer = changed[0].rpartition(".")
         raise ImpureError(f"{_called(module, owner)} changes its buffer {buffer!r} when it is called. {PURE}.")
@@ -502,7 +502,7 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
     if not _equal([first], again[-1].answer):
         pairs = zip(answers, again, strict=False)
         culprit = next((a.module for a, b in pairs if a.same_question(b) and not _equal(a.answer, b.answer)), module)
-        path = next(path for path, held in module.named_modules() if held is culprit)
+        path = next(path for path, submodule in module.named_modules() if submodule is culprit)
         raise ImpureError(
             f"{_called(module, path)} gives something else when it is called again with the same arguments. {PURE}."
         )
@@ -564,6 +564,6 @@ def _called(module: nn.Module, path: str) -> str:
     """A part of an interval in words; the interval itself is what its plant makes of it."""
     short = path.replace("interval.", "")
     if short in ("", "interval"):
-        plant = next((held for name, held in module.named_modules() if name.endswith("plant")), None)
+        plant = next((submodule for name, submodule in module.named_modules() if name.endswith("plant")), None)
         return f"a method of plant {getattr(plant, 'name', type(module).__name__)!r}"
     return f"{short} ({type(module.get_submodule(path)).__name__})"

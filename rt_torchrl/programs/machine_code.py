@@ -190,9 +190,9 @@ class LaneWriter:
         return self.emit(f"add nsw i64 {total}, {base}") if base else total
 
     def load(self, array: str, index: str, *, shared: bool = False) -> str:
-        element, known = ("double", ", !invariant.load !{}") if shared else (self.vector, "")
+        element, metadata = ("double", ", !invariant.load !{}") if shared else (self.vector, "")
         place = self.emit(f"getelementptr {element}, ptr {array}, i64 {index}")
-        value = self.emit(f"load {element}, ptr {place}, {WIDTH}{known}")
+        value = self.emit(f"load {element}, ptr {place}, {WIDTH}{metadata}")
         return self._in_all("double", value) if shared else value
 
     def _in_all(self, kind: str, number: str) -> str:
@@ -253,9 +253,9 @@ class LaneWriter:
             at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
             kinds = zip(("ptr", "i64", "i64"), at, strict=True)
             start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
-            here = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
+            address = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
             distance = self.emit(f"mul <{n} x i64> {lane}, {self._in_all('i64', across)}")
-            inputs["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
+            inputs["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {address}, <{n} x i64> {distance}"))
         return inputs
 
     def row(self, array: str, count: int, row: str) -> list[str]:
@@ -353,11 +353,11 @@ def _compiled(text: str) -> bytes:
     identity = (text, llvm.llvm_version_info, version("llvmlite"), llvm.get_host_cpu_name(), _features(), OPTIMISATION)
     path = cache_folder() / f"{hashlib.sha256(repr(identity).encode()).hexdigest()}.o"
     try:
-        held = path.read_bytes()
+        cached = path.read_bytes()
     except OSError:
-        held = b""
-    if held and hashlib.sha256(held[DIGEST:]).digest() == held[:DIGEST]:
-        return held[DIGEST:]
+        cached = b""
+    if cached and hashlib.sha256(cached[DIGEST:]).digest() == cached[:DIGEST]:
+        return cached[DIGEST:]
     code = _compile(text)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -136,9 +136,9 @@ class Program:
         """A function of numbers, by torch's name: what it is known to be, something simpler, or a new operation."""
         numbers = [self.as_number(a) for a in operands]
         known = [self.numbers.get(a) for a in numbers]
-        given = [torch.tensor(x, dtype=torch.float64) for x in known if x is not None]
-        if len(given) == len(known):
-            return self.constant(getattr(torch, name)(*given).item())
+        constants = [torch.tensor(x, dtype=torch.float64) for x in known if x is not None]
+        if len(constants) == len(known):
+            return self.constant(getattr(torch, name)(*constants).item())
         kind: Kind = "truth" if name in COMPARISONS else "number"
         simplified = SIMPLIFIED.get(name)
         return simplified(self, *numbers) if simplified else self.new(name, *numbers, kind=kind)
@@ -205,9 +205,9 @@ def _sign(p: Program, a: int) -> int:
 
 def _remainder(p: Program, a: int, b: int) -> int:
     """What is left of a division, with the sign of the divisor; exact, however large the quotient is."""
-    left, zero = p.apply("fmod", a, b), p.constant(0.0)
-    opposite = p.logic("xor", p.apply("lt", left, zero), p.apply("lt", b, zero))
-    return p.select(p.logic("and", opposite, p.apply("ne", left, zero)), p.apply("add", left, b), left)
+    remainder, zero = p.apply("fmod", a, b), p.constant(0.0)
+    opposite = p.logic("xor", p.apply("lt", remainder, zero), p.apply("lt", b, zero))
+    return p.select(p.logic("and", opposite, p.apply("ne", remainder, zero)), p.apply("add", remainder, b), remainder)
 
 
 def _number_of(how: str) -> Scalar:
@@ -250,4 +250,4 @@ OF_THREE: dict[str, Scalar] = {
     "threshold_backward": lambda p, g, x, low: p.select(p.apply("le", x, low), p.constant(0.0), g),
 }
 ELEMENTWISE: dict[str, Scalar] = {**OF_ONE, **OF_TWO, **OF_THREE}
-ARITY = {name: count for count, held in enumerate((OF_ONE, OF_TWO, OF_THREE), 1) for name in held}
+ARITY = {name: count for count, operators in enumerate((OF_ONE, OF_TWO, OF_THREE), 1) for name in operators}

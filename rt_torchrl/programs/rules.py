@@ -63,8 +63,8 @@ def _rows(cells: Tensor, dims: int | Sequence[int] | None) -> Tensor:
     """Cells as a matrix, with the dimensions ``dims`` (None or none for all) in its rows."""
     chosen = [dims] if isinstance(dims, int) else list(dims or range(cells.ndim))
     chosen = [d % cells.ndim for d in chosen]
-    kept = [d for d in range(cells.ndim) if d not in chosen]
-    return cells.permute(*kept, *chosen).reshape(math.prod(cells.shape[d] for d in kept), -1)
+    remaining = [d for d in range(cells.ndim) if d not in chosen]
+    return cells.permute(*remaining, *chosen).reshape(math.prod(cells.shape[d] for d in remaining), -1)
 
 
 def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = None) -> Tensor:
@@ -96,13 +96,13 @@ def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
 
 def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     p, (source, indices) = tracer.program, args
-    given = [i for i in indices if i is not None]
+    tensors = [i for i in indices if i is not None]
     cells = tracer.cells(source)
-    if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
+    if all(tracer.numbers(tracer.cells(i)) is not None for i in tensors):
         picked: Tensor = torch.ops.aten.index.Tensor(cells, indices)
         return picked
     array, walk = tracer.access(cells.flatten())
-    nan, rest, values = p.constant(math.nan), math.prod(source.shape[len(given) :]), []
+    nan, rest, values = p.constant(math.nan), math.prod(source.shape[len(tensors) :]), []
     for place, inside in _places(tracer, source.shape, indices):
         if walk is None:
             elements = [array] * rest
@@ -117,11 +117,11 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
 
 def _places(tracer: Tracer, shape: Sequence[int], indices: Sequence[Tensor | None]) -> Iterator[tuple[int, int]]:
     """Of every entry of indices that vary: its place in a tensor side by side, and whether it lies in the tensor."""
-    p, given = tracer.program, [i for i in indices if i is not None]
-    if None in indices[: len(given)] or any(i.dtype == torch.bool for i in given):
+    p, tensors = tracer.program, [i for i in indices if i is not None]
+    if None in indices[: len(tensors)] or any(i.dtype == torch.bool for i in tensors):
         raise tracer.refuse("an index by a mask that varies, or after a full slice", "use torch.where")
     strides, zero = torch.empty(tuple(shape), device="meta").stride(), p.constant(0.0)
-    spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
+    spread = torch.broadcast_tensors(*(tracer.cells(i) for i in tensors))
     for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
         place, inside = zero, []
         for index, size, stride in zip(at, shape, strides, strict=False):
@@ -137,15 +137,15 @@ def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
     target, indices, values = args[:3]
     p, cells = tracer.program, tracer.cells(target).flatten().tolist()
     added = (*args[3:], options.get("accumulate", False))[0]
-    given = [i for i in indices if i is not None]
-    if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
+    tensors = [i for i in indices if i is not None]
+    if all(tracer.numbers(tracer.cells(i)) is not None for i in tensors):
         places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
         assigned = tracer.cells(values).expand(places.shape).flatten().tolist()
         for place, value in zip(places.flatten().tolist(), assigned, strict=True):
             cells[place] = p.apply("add", cells[place], value) if added else value
         return in_shape(cells, target.shape)
-    rest = target.shape[len(given) :]
-    at = torch.broadcast_shapes(*(i.shape for i in given))
+    rest = target.shape[len(tensors) :]
+    at = torch.broadcast_shapes(*(i.shape for i in tensors))
     rows = tracer.cells(values).expand(*at, *rest).reshape(-1, math.prod(rest)).tolist()
     if len(rows) * len(cells) > SPREAD:
         raise tracer.refuse(f"an assignment to {len(cells)} places that vary", "use torch.where")
@@ -231,8 +231,8 @@ def _copy_by(name: str) -> Rule:
                 return tracer.cells(x)
             return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
 
-        kept = {key: value for key, value in options.items() if key != "memory_format"}
-        return operator(*map(celled, args), **kept)
+        keywords = {key: value for key, value in options.items() if key != "memory_format"}
+        return operator(*map(celled, args), **keywords)
 
     return rule
 

@@ -217,8 +217,8 @@ class Tracer(TorchDispatchMode):
             if packet in DECISIONS:
                 self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
                 return func(*args, **kwargs)
-            known = name in self._rules or name in self._decompositions
-            if not known and func._can_decompose():  # into views or copies, depending on the strides
+            has_rule = name in self._rules or name in self._decompositions
+            if not has_rule and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
             if func.is_view or torch.Tag.inplace_view in func.tags:  # a view shares the cells
@@ -234,7 +234,7 @@ class Tracer(TorchDispatchMode):
                 with self:
                     result = self._translated(func, self._decompositions[name], *args, **kwargs)
                     return args[0].copy_(result) if in_place else result
-            if not known and not in_place and (decomposition := self._of_torch().get(func)):
+            if not has_rule and not in_place and (decomposition := self._of_torch().get(func)):
                 with self:
                     return decomposition(*args, **kwargs)
             return self._executed(func, name, args, kwargs)

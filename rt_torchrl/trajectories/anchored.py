@@ -91,7 +91,7 @@ class AnchoredReplays:
         policy_of: Callable[[int], nn.Module],
     ):
         self.twin, self.twin_anchored, believed = twin, anchored, twin.believed
-        self.read: Starts = torch.stack([record.states[0] for record in records])
+        self.starts: Starts = torch.stack([record.states[0] for record in records])
         self.low, self.high = bounds(twin.plant.actions, device=inputs.device)
         n, increments, counted = inputs.shape[1], [], []
         for record, exogenous in zip(records, inputs, strict=True):
@@ -99,8 +99,8 @@ class AnchoredReplays:
             missed = differences(twin.plant.readings, record.states[1:], ends[1:, :r])
             increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), r)]))
             rest = n - len(record.actions)  # the state in which it ended early
-            known = torch.cat([record.states, ends[:, r:]], -1)
-            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (known, record.actions))
+            full = torch.cat([record.states, ends[:, r:]], -1)
+            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (full, record.actions))
             counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], exogenous[None])))
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
@@ -122,10 +122,10 @@ class AnchoredReplays:
 
     def latest(self, count: int) -> "AnchoredReplays":
         """Those of the last episodes, at most as many."""
-        if count >= len(self.read):
+        if count >= len(self.starts):
             return self
         last = copy.copy(self)
-        last.read, last.inputs, last.anchored = (x[-count:] for x in (self.read, self.inputs, self.anchored))
+        last.starts, last.inputs, last.anchored = (x[-count:] for x in (self.starts, self.inputs, self.anchored))
         last.offsets, last.flown, last.explored = (x[-count:] for x in (self.offsets, self.flown, self.explored))
         return last
 
@@ -138,7 +138,7 @@ class AnchoredReplays:
         Raises:
             DivergenceError: if a replay diverges under the policy.
         """
-        rest, alone = self.twin_anchored.plant.at_rest(self.read), self.twin.plant.at_rest(self.read)
+        rest, alone = self.twin_anchored.plant.at_rest(self.starts), self.twin.plant.at_rest(self.starts)
         anchored = self.twin_anchored.episode_costs(policy, rest, self.anchored)
         return _log_ratio(anchored, self.twin.episode_costs(policy, alone, self.inputs)) + self.offsets
 

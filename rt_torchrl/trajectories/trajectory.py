@@ -43,11 +43,11 @@ class Trajectory(NamedTuple):
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
         states, actions, exogenous, start, seen = self
-        held, samples = slice(first, last), slice(first, last + 1)
+        steps, samples = slice(first, last), slice(first, last + 1)
         return Trajectory(
             states[..., samples, :],
-            actions[..., held, :],
-            exogenous[..., held, :],
+            actions[..., steps, :],
+            exogenous[..., steps, :],
             start + first * dt,
             None if seen is None else seen[..., samples],
         )

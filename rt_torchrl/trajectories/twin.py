@@ -112,8 +112,8 @@ class DigitalTwin:
             DivergenceError: if they diverge all the same.
         """
         start = self.plant.at_rest(record.states[:1])
-        held = torch.cat([record.actions, record.states[:-1]], -1)
-        drive = drive_of(self.plant, record.exogenous[None], held[None], start=record.start)
+        commands = torch.cat([record.actions, record.states[:-1]], -1)
+        drive = drive_of(self.plant, record.exogenous[None], commands[None], start=record.start)
         # Kept, because the engine compares what is new to it with all that it knows, which takes milliseconds.
         if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
             self._read = ReadInterval(self.plant, self.closure, None)
@@ -251,8 +251,8 @@ class TangentInterval(nn.Module):
 
 def jacobians_of(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
     """[∂Φ/∂s, ∂Φ/∂w] of every row, ``rows n_s n_s+n_w``, by a reverse-mode product for each state."""
-    held = dict(interval.closure.named_parameters())
-    weights = {f"closure.{name}": held[name] for name in names}
+    parameters = dict(interval.closure.named_parameters())
+    weights = {f"closure.{name}": parameters[name] for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
         return with_weights(interval, values, state, Drive(*drive))

@@ -65,10 +65,10 @@ class Inputs:
         ends = accumulate(w.numel() for w in self._all)
         return [(w.detach().numpy(), end) for w, end in zip(self._all, ends, strict=True)]
 
-    def row(self, read: Iterable[int] | None = None) -> np.ndarray:
+    def row(self, indices: Iterable[int] | None = None) -> np.ndarray:
         """The present numbers of all of them as one row, or of those that are read."""
         numbers = np.empty(max([1, *(end for _, end in self._places)]))
-        for k in range(len(self._all)) if read is None else read:
+        for k in range(len(self._all)) if indices is None else indices:
             x, end = self._places[k]
             numbers[end - x.size : end] = x.ravel()
         return numbers
@@ -220,7 +220,7 @@ class IntervalCode:
         if end.shape != state.shape:
             raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
         self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        self.read = _read_by(tracer, interval, tracer.outputs(end))
+        self.read_inputs = _read_by(tracer, interval, tracer.outputs(end))
         """Numbers of the inputs that the code reads, of which a large table may not be one."""
         self.march = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
         x, start = point.in_lanes()
@@ -256,7 +256,7 @@ class IntervalCode:
         values = map(tracer.outputs, gradients)
         outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
         code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
-        self.read |= _read_by(tracer, interval, chain.from_iterable(outputs))
+        self.read_inputs |= _read_by(tracer, interval, chain.from_iterable(outputs))
         self._compare_sweep(code, interval, driven)
         self.outside = outside_of(interval, holdings or Holdings(interval), self._executed)
         self.sweeps[driven] = code
@@ -450,7 +450,7 @@ def require_pure_policy(policy: nn.Module, observation: Tensor) -> None:
 
 
 def _require_once(key: nn.Module, module: nn.Module, question: Callable[[], Sequence[Any]]) -> None:
-    modes = tuple(part.training for part in key.modules())
+    modes = tuple(submodule.training for submodule in key.modules())
     if _modes.get(key) != modes:
         require_pure(module, *question())
         _modes[key] = modes

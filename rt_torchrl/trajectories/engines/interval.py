@@ -87,13 +87,13 @@ def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor,
     """
     everywhere = dict(interval.named_parameters(remove_duplicate=False))
     replacements = {id(everywhere[name]): tensor for name, tensor in weights.items()}
-    held = {
+    tensors = {
         f"{path}.{name}".lstrip("."): replacements[id(w)]
         for path, module in interval.named_modules()  # each module once
         for name, w in module.named_parameters(recurse=False, remove_duplicate=False)
         if id(w) in replacements
     }
-    end: Tensor = torch.func.functional_call(interval, held, (state, drive), tie_weights=False)
+    end: Tensor = torch.func.functional_call(interval, tensors, (state, drive), tie_weights=False)
     return end
 
 

@@ -79,7 +79,7 @@ class _Task:
 
     def __init__(self, code: IntervalCode, inputs: Inputs, initial_state: Tensor, drive: Drive):
         self.code, self.inputs, self.lanes = code, inputs, code.lanes.number
-        self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row(code.read)
+        self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row(code.read_inputs)
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
         self._signals = signals_of(self.drive)
