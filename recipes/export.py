@@ -77,7 +77,8 @@ class Config:
 def main(config: Config) -> None:
     formats = config.formats or DEFAULT
     if "onnx" in formats:
-        require_packages(ONNX_PACKAGES)
+        others = " ".join(kind for kind in formats if kind != "onnx") or " ".join(DEFAULT)
+        require_packages(ONNX_PACKAGES, f"leave it out by --formats {others}")
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):

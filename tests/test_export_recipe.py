@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,16 @@ def test_bad_options_are_refused(options, message, tmp_path):
     export = recipe("export")
     with pytest.raises(ValueError, match=message):
         export.main(export.Config(run=tmp_path, **options))
+    assert not (tmp_path / "exported").exists()
+
+
+@pytest.mark.parametrize(("formats", "rest"), [(("c", "onnx"), "c"), (("onnx",), "c pt2")])
+def test_without_the_packages_of_onnx_what_can_be_written_is_said_before_any_work(formats, rest, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    export = recipe("export")
+    message = rf"ONNX needs the package onnx: .*--extra export.*; or leave it out by --formats {rest}\."
+    with pytest.raises(ValueError, match=message):
+        export.main(export.Config(run=tmp_path, formats=formats))
     assert not (tmp_path / "exported").exists()
 
 

@@ -139,8 +139,12 @@ def interface(plant: Plant) -> dict[str, Any]:
     }
 
 
-def require_packages(needed: Sequence[str]) -> None:
+def require_packages(needed: Sequence[str], otherwise: str = "take the .pt2 program or C") -> None:
     """Refuse to go on without packages of the extra ``export``.
+
+    Args:
+        needed: names of the packages.
+        otherwise: what can be done without them.
 
     Raises:
         ValueError: if a package is not installed.
@@ -150,7 +154,8 @@ def require_packages(needed: Sequence[str]) -> None:
             importlib.import_module(package)
         except ImportError as error:
             raise ValueError(
-                f"ONNX needs the package {package}: install the extra, pip install 'rt_torchrl[export]'."
+                f"ONNX needs the package {package}: install the extra, uv run --extra export or pip install "
+                f"'rt_torchrl[export]'; or {otherwise}."
             ) from error
 
 
