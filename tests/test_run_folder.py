@@ -317,19 +317,26 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 7")
 
 
-def test_a_run_without_an_episode_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
+def test_a_config_of_somebody_else_is_not_overwritten(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"config\.json is not that of a run: it does not name a plant"):
+        small_run(tmp_path, episodes=1, **QUICK)
+
+
+def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
     def killed(self, episode):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
         patched.setattr(MakePlan, "forward", killed)
-        with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
-            small_run(tmp_path, episodes=1, **QUICK).train()
-    with pytest.raises(ValueError, match="holds a run already; --resume it, or choose another folder"):
-        small_run(tmp_path, episodes=1, **QUICK)
+        for _ in range(2):  # the same command again, although the first has written the options
+            with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
+                small_run(tmp_path, episodes=1, **QUICK).train()
     resumed = small_run(tmp_path, episodes=1, resume=True, **QUICK).train()
     assert "has no episode done yet: it starts from its beginning" in capsys.readouterr().out
     whole = small_run(tmp_path / "whole", episodes=1, **QUICK).train()
     for record in (*resumed["episodes"], *whole["episodes"]):
         record["seconds"] = None
     assert resumed["episodes"] == whole["episodes"]
+    with pytest.raises(ValueError, match="holds a run already; --resume it, or choose another folder"):
+        small_run(tmp_path, episodes=1, **QUICK)

@@ -196,7 +196,7 @@ class Run:
             with termination_as_interrupt():
                 return self._train()
         except (KeyboardInterrupt, OSError) as error:
-            if self._held.holds_run():
+            if self.episodes:
                 how = "ended at once" if isinstance(error, KeyboardInterrupt) else "stopped"
                 done = len(self.episodes)
                 print(f"{how}: {done} episodes done are in {self.folder}; --resume goes on with them")

@@ -15,7 +15,7 @@ import torch
 
 from rt_torchrl.atomic_file import make_folder, new_folder, remove_partials, write_atomically
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import FILE, require_same, write_settings
+from rt_torchrl.runs.settings import FILE, read_settings, require_same, write_settings
 
 if TYPE_CHECKING:
     from rt_torchrl.algorithm import ReinforcementTwinning  # only its type: who reads weights needs no TorchRL
@@ -284,8 +284,10 @@ class RunFolder:
 
     def _require_consistent(self) -> None:
         if not self._config.resume:
-            if any((self.path / name).exists() for name in WRITTEN):
+            if checkpoints(self.path) or any((self.path / name).exists() for name in RESULTS):
                 raise ValueError(f"log_dir={self.path} holds a run already; --resume it, or choose another folder.")
+            if self.holds_run():
+                read_settings(self.path)  # which refuses a file of somebody else that would be overwritten
             return
         if not self.holds_run():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
