@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl import (
     Actuation,
+    ClassicalController,
     Measurement,
     Plant,
     PlantEnv,
@@ -114,6 +115,28 @@ class Arm(Plant):
 
     def make_closure(self, generator=None):
         return Inertia([0.1, 0.05])
+
+
+class Stopped(Arm):
+    """The arm, whose second joint runs into a stiff stop that its twin does not know."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        beyond = state[..., 1] - state[..., 1].clamp(-0.3, 0.3)
+        stop = (2e4 * beyond + 20.0 * state[..., 3] * (beyond != 0.0)).unsqueeze(-1)
+        rate = super().vector_field(t, state, action, exogenous, closure)
+        return torch.cat([rate[..., :3], rate[..., 3:] - stop], -1)
+
+
+class Servo(ClassicalController):
+    """Holds both joints at zero; through a wrong sign it drives them away."""
+
+    gain_units = {"proportional": "N m/rad", "derivative": "N m s/rad"}
+    default_gains = (8.0, 0.5)
+    memory_size = 0
+
+    def law(self, state, memory, exogenous):
+        proportional, derivative = self.gains.unbind()
+        return -proportional * state[..., :2] - derivative * state[..., 2:], memory
 
 
 class Inertia(PositiveCoefficients):
@@ -273,6 +296,34 @@ def test_a_start_far_from_what_the_plant_draws_is_a_warning():
     with pytest.warns(UserWarning, match="state angle_2 is read at the start between 1.5.* draws 0.00.* a wrong zero"):
         check.require()
     check_real_system(wired(ARM), ARM).require()
+
+
+@pytest.mark.parametrize(
+    ("signs", "words"),
+    [
+        ([1.0, 1.0], []),
+        ([1.0, -1.0], ["action torque_2 has the other sign"]),
+        ([-1.0, -1.0], ["all actions have the other sign"]),
+    ],
+)
+def test_a_sign_is_named_although_feedback_through_it_drives_the_system_into_a_stop(signs, words):
+    check = check_real_system(wired(ARM, real=Stopped(), sent=(signs, 0.0)), ARM, policy=Servo(ARM), spread=0.03)
+    assert [mistake.mistake for mistake in check.mistakes] == words
+
+
+class Steady(FourTanks):
+    """Four tanks whose set points stay as they are in an episode."""
+
+    def draw_exogenous(self, batch, generator):
+        return super().draw_exogenous(batch, generator)[:, :1].expand(-1, self.n_steps, -1).clone()
+
+
+def test_set_points_that_are_read_relative_to_what_they_are_for_are_a_warning():
+    plant = Steady()
+    relative = Reading(keys=("exogenous", "state"), of=lambda wanted, level: wanted - level[..., :2])
+    check = check_real_system(wired(plant, inputs=relative), plant)
+    assert not check.mistakes and "the readings of input set_point_1, set_point_2 move" in str(check)
+    assert not check_real_system(wired(plant), plant).doubts
 
 
 @pytest.mark.parametrize("column", [0, 1])

@@ -14,6 +14,7 @@ dynamics that the twin lacks leave up to all of the movement unexplained, too.
 import copy
 import itertools
 import math
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -51,10 +52,12 @@ MARGIN = math.log(8.0)
 """Least gain of a mistake that is named, and by how much it must be ahead of others to be named alone."""
 LARGE, WORST = 1e3, 1e6
 """Error, in movements, and share that stand for a prediction that is not finite."""
-EVALUATIONS = 12
-"""Greatest number of evaluations in a fit of the coefficients."""
+EVALUATIONS, QUICK = 12, 4
+"""Greatest number of evaluations in a fit of the coefficients, and in the first one of each mistake."""
 FITTED = 12
-"""Number of mistakes, the best ones under coefficients that are known, to which the coefficients are fitted."""
+"""Number of mistakes, the best ones after their first fit, to which the coefficients are fitted."""
+EARLY = 6
+"""First intervals of a flight that are looked at alone: feedback through a mistake may drive the system into a stop."""
 RATIOS = (0.1, 0.2, 0.25, 0.4, 0.5, 2.0, 2.5, 4.0, 5.0, 10.0)
 """Ratios of the real control interval to the plant's that are tried."""
 CORRELATION = 3.0
@@ -195,9 +198,9 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
 
 
 def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
-    """At most so many intervals of a record."""
+    """So many intervals of a record, if it has them, and all of the first ones."""
     n = len(record.actions)
-    rows = torch.linspace(0, n - 1, min(n, count)).long()
+    rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, count)).long()]).unique()
     before = (rows - 1).clamp(min=0)
     t = float(record.start) + plant.dt * rows.double()
     states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
@@ -221,8 +224,9 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     unknown = torch.full_like(moved, torch.nan)
     mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
     if not mistakes and not explained:
-        mistakes = _better(present, fit, flown, list(_mistakes(plant, flown)))
-    doubts = () if mistakes else (*_doubts(plant, present), *_strange_starts(plant, flown))
+        mistakes = _at_first(fit, flown) or _better(present, fit, flown)
+    doubts = (*_doubts(plant, present), *_strange_starts(plant, flown), *_moving_inputs(plant, flown))
+    doubts = () if mistakes else doubts
     return Wiring(plant, present, moved, tuple(mistakes), doubts)
 
 
@@ -231,8 +235,8 @@ def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
     shares = zip(plant.states, present.unexplained.tolist(), strict=True)
     if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
         yield (
-            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, or a "
-            "mistake in a Reading, an Actuation or the plant's equations"
+            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, such as "
+            "a stop, or a mistake in a Reading, an Actuation or the plant's equations"
         )
 
 
@@ -266,6 +270,18 @@ def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
             yield f"input {signal.name} is read {_beside(signal, read, course)}"
 
 
+def _moving_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
+    """Which inputs are read to move within an episode, where the plant draws constant ones."""
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
+    constant, size = (drawn == drawn[:, :1]).all(1).all(0), drawn.abs().amax((0, 1))
+    moves = (flown.exogenous - flown.earlier_exogenous).abs().amax(0) > RESOLUTION * size
+    if names := [signal.name for signal, odd in zip(plant.inputs, constant & moves, strict=True) if odd]:
+        yield (
+            f"the readings of input {', '.join(names)} move within an episode, where the plant draws constant ones: "
+            "read relative to something that moves, or other courses than those that plans are made for"
+        )
+
+
 def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
     """Readings beside draws in words."""
     return (
@@ -281,7 +297,20 @@ def _outside(course: Tensor, read: Tensor) -> bool:
     return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > (BEYOND - 1.0) * width
 
 
-def _better(present: Suspicion, fit: "_Fit", flown: Flown, mistakes: list[tuple[str, Flown]]) -> list[Suspicion]:
+def _at_first(fit: "_Fit", flown: Flown) -> list[Suspicion]:
+    """The mistakes that explain all movement in the first intervals of the flights, where the wiring as it is does not.
+
+    More coefficients than readings there would explain anything.
+    """
+    rows = flown.t < (EARLY - 0.5) * fit.plant.dt
+    early = Flown._make([*(column[rows] for column in flown[:7]), flown.ratio, flown.signs])
+    present = fit.suspicion("", early)
+    if early.ends.numel() <= len(fit.guess) or not (present.unexplained > EXPLAINED).any():
+        return []
+    return [mistake for mistake in _better(present, fit, early) if not (mistake.unexplained > EXPLAINED).any()]
+
+
+def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
     """The mistakes that fit much better than the wiring as it is, one of a kind.
 
     A mistake in the reading of a state must leave at most half of that state. Where no error of the present wiring
@@ -290,7 +319,8 @@ def _better(present: Suspicion, fit: "_Fit", flown: Flown, mistakes: list[tuple[
     shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any()
     enough = torch.where(present.unexplained > 2.0 * EXPLAINED, 0.5 * present.unexplained, EXPLAINED)
     tried = []
-    for words, mended in sorted(mistakes, key=lambda mistake: fit.score(mistake[1]))[:FITTED]:
+    mistakes = sorted(_mistakes(fit.plant, flown), key=lambda mistake: fit.suspicion(*mistake, QUICK).score)
+    for words, mended in mistakes[:FITTED]:
         mistake = fit.suspicion(words, mended)
         changed = (mended.states != flown.states).any(0)
         limit = torch.where(changed, enough, torch.inf) if shows else EXPLAINED
@@ -300,7 +330,7 @@ def _better(present: Suspicion, fit: "_Fit", flown: Flown, mistakes: list[tuple[
     kinds: dict[str, Suspicion] = {}
     for mistake in tried:
         if mistake.score < min(present.score, tried[0].score + 2.0 * MARGIN) - MARGIN:
-            kinds.setdefault(mistake.mistake.partition(",")[0], mistake)
+            kinds.setdefault(re.split(",| in ", mistake.mistake)[0], mistake)
     return list(kinds.values())
 
 
@@ -356,42 +386,26 @@ class _Fit:
     """
 
     def __init__(self, plant: Plant, closure: nn.Module):
-        self._plant, self._closure = plant, copy.deepcopy(closure).cpu()
+        self.plant, self._closure = plant, copy.deepcopy(closure).cpu()
         self._twin = DigitalTwin(plant, self._closure)
         self._weights = [weight for weight in self._closure.parameters() if weight.requires_grad]
         guess = parameters_to_vector(self._weights) if self._weights else torch.zeros(0, dtype=torch.float64)
-        self._guess = self._known = guess.detach().clone()  # at first, and after the last fit
+        self.guess = guess.detach().clone()
 
-    def suspicion(self, mistake: str, flown: Flown) -> Suspicion:
-        """A wiring with the coefficients that fit it best."""
-        if self._weights:
-            self._known = self._fitted(flown)
-        return self._suspicion(mistake, flown, self._errors(flown, self._known)[0])
-
-    def score(self, flown: Flown) -> float:
-        """Score of a wiring with the coefficients of the first guess or the last fit, or a linear fit about them."""
-        scores = []
-        for weights in (self._guess, self._known):
-            error, slopes = self._errors(flown, weights)
-            scores.append(self._suspicion("", flown, error).score)
-            size, moves = self.movement(flown)
-            target, rows = (error / size)[:, moves].flatten(), (slopes / size[:, None])[:, moves].flatten(0, 1)
-            if len(weights) and target.isfinite().all() and rows.isfinite().all():
-                change = torch.linalg.lstsq(rows, target, driver="gelsd").solution
-                scores.append(self._suspicion("", flown, error - slopes @ change).score)
-        return min(scores)
-
-    def _suspicion(self, mistake: str, flown: Flown, errors: Tensor) -> Suspicion:
+    def suspicion(self, mistake: str, flown: Flown, evaluations: int = EVALUATIONS) -> Suspicion:
+        """A wiring with the coefficients that fit it best after so many evaluations."""
+        weights = self._fitted(flown, evaluations) if self._weights else self.guess
+        errors = self._errors(flown, weights)[0]
         error, (size, moves) = errors.square().mean(0), self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
         return Suspicion(mistake, share, error.sqrt())
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
-        size = _movement(self._plant, flown).square().mean(0).sqrt()
+        size = _movement(self.plant, flown).square().mean(0).sqrt()
         return size, size > STILL * (1.0 + flown.states.abs().amax(0))
 
-    def _fitted(self, flown: Flown) -> Tensor:
+    def _fitted(self, flown: Flown, evaluations: int) -> Tensor:
         from scipy.optimize import least_squares  # here, because it takes a second to load
 
         size, moves = self.movement(flown)
@@ -406,7 +420,7 @@ class _Fit:
             change = -(slopes[weights.tobytes()] / size[:, None])[:, moves]
             return change.flatten(0, 1).nan_to_num(0.0, 0.0, 0.0).numpy()
 
-        best = least_squares(residuals, self._guess.numpy(), jac=jacobian, max_nfev=EVALUATIONS)
+        best = least_squares(residuals, self.guess.numpy(), jac=jacobian, max_nfev=evaluations)
         return torch.as_tensor(best.x)
 
     @torch.no_grad()
@@ -422,9 +436,9 @@ class _Fit:
             nan = torch.full_like(flown.ends, torch.nan)
             return nan, nan[..., None].expand(-1, -1, len(weights))
         share = flown.signs * torch.full((flown.states.shape[-1],), flown.ratio / steps, dtype=torch.float64)
-        movement = share * differences(self._plant.states, ends[:, -1], flown.states)
-        error = _movement(self._plant, flown) - movement
-        return differences(self._plant.states, error, torch.zeros_like(error)), share[:, None] * slopes[:, -1]
+        movement = share * differences(self.plant.states, ends[:, -1], flown.states)
+        error = _movement(self.plant, flown) - movement
+        return differences(self.plant.states, error, torch.zeros_like(error)), share[:, None] * slopes[:, -1]
 
 
 def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
