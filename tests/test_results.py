@@ -230,3 +230,7 @@ def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
     )
     with pytest.raises(ValueError, match=message):
         read_metrics(tmp_path)
+    (tmp_path / "metrics.json").write_text(json.dumps({"episodes": [], "summary": {"live": "pilot"}}))
+    message = r"metrics\.json is damaged: summary names the live policy 'pilot'; it must be model_based or model_free"
+    with pytest.raises(ValueError, match=message):
+        read_metrics(tmp_path)

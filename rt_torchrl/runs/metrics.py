@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from rt_torchrl.atomic_file import read_json
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import ROLES, Role
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
@@ -23,6 +23,8 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         raise ValueError(
             f"{file} is damaged: it must be an object with episodes, a list of objects, and summary, an object."
         )
+    if (live := summary.get("live")) not in ROLES:
+        raise ValueError(f"{file} is damaged: summary names the live policy {live!r}; it must be {' or '.join(ROLES)}.")
     return metrics
 
 
