@@ -123,7 +123,8 @@ def test_the_callback_of_the_documentation_tells_a_logger(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     scope = {}
     exec(compile(blocks("habits.md", "python")[1], "docs/habits.md", "exec"), scope)
-    assert scope["to_logger"]([{"episode": 0, "real_cost": 0.5, "rms/speed [rad/s]": 0.1, "live": "model_free"}]) is None
+    record = {"episode": 0, "real_cost": 0.5, "rms/speed [rad/s]": 0.1, "live": "model_free"}
+    assert scope["to_logger"]([record]) is None
     (curve,) = tmp_path.rglob("real_cost.csv")
     assert curve.read_text().split() == ["0,0.5"] and len(list(tmp_path.rglob("speed.csv"))) == 1
 
