@@ -319,8 +319,8 @@ def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
     shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any()
     enough = torch.where(present.unexplained > 2.0 * EXPLAINED, 0.5 * present.unexplained, EXPLAINED)
     tried = []
-    mistakes = sorted(_mistakes(fit.plant, flown), key=lambda mistake: fit.suspicion(*mistake, QUICK).score)
-    for words, mended in mistakes[:FITTED]:
+    ranked = sorted(_mistakes(fit.plant, flown), key=lambda pair: fit.suspicion(pair[0], pair[1], QUICK).score)
+    for words, mended in ranked[:FITTED]:
         mistake = fit.suspicion(words, mended)
         changed = (mended.states != flown.states).any(0)
         limit = torch.where(changed, enough, torch.inf) if shows else EXPLAINED
