@@ -9,7 +9,7 @@ from seeds_and_numbers import seeded
 
 from rt_torchrl import DigitalTwin, ExogenousConfig, Signal
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.steps.inputs import ExogenousProcess, VirtualEpisodes
+from rt_torchrl.steps.inputs import ExogenousProcess, VirtualEpisodes, mixed
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5
@@ -110,6 +110,41 @@ def test_components_keep_their_correlation(correlation, lag):
     size = found.covariance[0].diagonal().prod().sqrt().item()
     for h in LAGS:
         assert cross_covariance(found, h) / size == pytest.approx(correlation * 0.5 ** abs(h + lag), abs=0.1), h
+
+
+def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
+    """Their mean is that of those met, and their covariance 1 + 1/m times that of the sample."""
+    m, n, count = 9, 40, 100_000
+    t = torch.linspace(0.0, 1.0, n, dtype=torch.float64)
+    level, slope = torch.randn(2, m, 1, generator=seeded(3), dtype=torch.float64)
+    met = torch.stack([8.0 + level + slope * t, 3.0 - 0.5 * level + (t > 0.5)], -1)
+    found = mixed(list(met), count, seeded())
+    assert found.shape == (count, n, 2)
+    flat, own = found.flatten(1), met.flatten(1)
+    deviation = own.std(0)
+    assert ((flat.mean(0) - own.mean(0)).abs() / deviation).max() < 0.01
+    scale = deviation[:, None] * deviation
+    assert ((flat.T.cov() - (1 + 1 / m) * own.T.cov()).abs() / scale).max() < 0.01
+    # A normal number is beyond 2.576 in one of a hundred draws.
+    standard = (flat[:, 0] - own[:, 0].mean()) / (deviation[0] * (1 + 1 / m) ** 0.5)
+    assert (standard.abs() > 2.576).double().mean().item() == pytest.approx(0.01, abs=5e-4)
+
+
+def test_large_scales_are_mixed_from_the_third_episode_on():
+    plant = WindTurbine(horizon=60.0)
+    levels, seen = (8.0, 11.0, 14.0), {}
+    for count in (2, 3):
+        config = ExogenousConfig(large_scale="mixed")
+        virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 3, generator=seeded())
+        for level in levels[:count]:
+            record = torch.full((plant.n_steps, 1), level, dtype=torch.float64)
+            virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.inputs))
+        seen[count] = virtual.draw(200).exogenous[..., 0]
+    assert {round(value, 6) for value in seen[2].mean(1).tolist()} == {8.0, 11.0}
+    new = seen[3].mean(1)
+    assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
+    low, high = plant.inputs[0].low, plant.inputs[0].high
+    assert (seen[3] >= low).all() and (seen[3] <= high).all()
 
 
 def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():

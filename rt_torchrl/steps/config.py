@@ -15,6 +15,7 @@ Role = Literal["model_free", "model_based"]
 Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 RefereeName = Literal["decision_tree", "expected_cost"]
+LargeScale = Literal["met", "mixed", "drawn"]
 EXPERIENCE = 100
 """Number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; the paper has 1."""
 LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
@@ -71,14 +72,16 @@ class ExogenousConfig:
         penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
         tube: half-width ε of the regression's tube, in standard deviations of the record.
         large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
-            paper, or drawn for inputs that the plant draws, where these are known beforehand, as set points are.
+            paper; mixed for new ones that differ from the mean of those met as these do, see :func:`mixed`; or drawn
+            for inputs that the plant draws, where these are known beforehand, as set points are. A policy with hundreds
+            of weights fits itself to a few winds that were met, and few winds do not hold the rare ones that cost most.
     """
 
     knots: Annotated[int, Field(ge=8)] = 300
     kernel_width: Positive = 2.0
     penalty: Positive = 10.0
     tube: Positive = 0.05
-    large_scale: Literal["met", "drawn"] = "met"
+    large_scale: LargeScale = "met"
 
 
 @configuration

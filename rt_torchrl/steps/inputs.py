@@ -18,12 +18,15 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.steps.config import ExogenousConfig
+from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.report import Step, record_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
+
+ENOUGH = 3
+"""Number of episodes from which on their large scales say how much others may differ."""
 
 
 class ExogenousProcess:
@@ -37,7 +40,7 @@ class ExogenousProcess:
     .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
 
     are the sample covariances times a Parzen window, which keeps them positive semi-definite. Circulant embedding
-    samples them exactly. The large scales themselves do not vary between realisations.
+    samples them exactly. The large scales themselves do not vary between realisations, unless they are mixed.
 
     Args:
         record: exogenous input z at every control interval.
@@ -92,8 +95,20 @@ class ExogenousProcess:
         process._low, process._high = bounds(signals, dtype=process.mean.dtype, device=process.mean.device)
         return process
 
-    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
-        """So many realisations of the input, within the physical ranges of the signals."""
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator,
+        *,
+        large: Float[Tensor, "{count} n n_z"] | None = None,
+    ) -> Float[Tensor, "{count} n n_z"]:
+        """Realisations of the input, within the physical ranges of the signals.
+
+        Args:
+            count: number of realisations.
+            generator: source of the draws.
+            large: large scale of each; by default that of the record.
+        """
         n, n_z = self.mean.shape
         shape = (count, 2 * n, n_z)
         noise = torch.complex(
@@ -101,11 +116,15 @@ class ExogenousProcess:
         )
         coloured = (self._root * noise.unsqueeze(-2)).sum(-1)
         small = torch.fft.fft(coloured, dim=1).real[:, :n]
-        return (self.mean + small).clamp(self._low, self._high)
+        return ((self.mean if large is None else large) + small).clamp(self._low, self._high)
 
 
 def sample_experience(
-    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+    processes: Sequence[ExogenousProcess],
+    count: int,
+    generator: torch.Generator,
+    *,
+    large_scale: LargeScale = "met",
 ) -> Float[Tensor, "{count} n n_z"]:
     """Realisations from the processes of several episodes, in random order; each is drawn once before any is again.
 
@@ -113,11 +132,57 @@ def sample_experience(
         processes: processes of the episodes.
         count: number of realisations.
         generator: source of the draws.
+        large_scale: see :class:`ExogenousConfig`. Until three episodes can be mixed, they are taken as met.
     """
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
     chosen = torch.cat(order)[:count].tolist()
-    return torch.cat([processes[k].sample(1, generator) for k in chosen])
+    larges = mixed([one.mean for one in processes], count, generator) if large_scale == "mixed" else None
+    each = [None] * count if larges is None else larges.split(1)
+    return torch.cat([processes[k].sample(1, generator, large=large) for k, large in zip(chosen, each, strict=True)])
+
+
+def mixed(
+    larges: Sequence[Float[Tensor, "n n_z"]], count: int, generator: torch.Generator
+) -> Float[Tensor, "{count} n n_z"] | None:
+    r"""New large scales, which differ from the mean of those met as these do from each other.
+
+    .. math::
+        \tilde d'(t) = \bar d(t) + \sqrt{\frac{m + 1}{m\,(m - 1)}}\;
+            \sum_{j=1}^m\xi_j\,\big(\tilde d_j(t) - \bar d(t)\big), \qquad \xi_j \sim \mathcal N(0, 1)
+
+    Their covariance is 1 + 1/m times that of those met, because the mean is uncertain, too. All inputs and all times of
+    an episode have the same ξ, so that they move together as in the episodes met. The ξ are quasi-random, along the
+    principal components of the large scales met: some tens of draws hold rare ones as often as they come. Student's
+    distribution, which also knows that few episodes leave the covariance uncertain, is no help: after three episodes
+    its tails hold gusts that nothing could fly in, and a plan then considers nothing else.
+
+    Args:
+        larges: the m large scales met.
+        count: number of new ones.
+        generator: source of the new ones.
+
+    Returns:
+        The new ones; None if there are fewer than three, of which nobody can tell how much others may differ.
+
+    Source: Owen, Scrambled net variance for integrals of smooth functions, Ann. Statist. 25 (1997) 1541.
+    """
+    m = len(larges)
+    if m < ENOUGH:
+        return None
+    met = torch.stack(list(larges))
+    centre = met.mean(0)
+    changes = (met - centre) / (met - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
+    components = torch.linalg.eigh(changes.flatten(1) @ changes.flatten(1).T).eigenvectors.flip(1)
+    weights = _quasi_normal(count, m, generator).to(met) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
+    return centre + torch.einsum("cm,mnz->cnz", weights, met - centre)
+
+
+def _quasi_normal(count: int, dimensions: int, generator: torch.Generator) -> Float[Tensor, "{count} {dimensions}"]:
+    """Standard normal numbers that fill the space evenly; each draw is distributed as an independent one."""
+    seed = int(torch.randint(2**31, (), generator=generator, device=generator.device))
+    unit = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+    return torch.special.ndtri(unit.clamp(2.0**-31, 1.0 - 2.0**-31))
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
@@ -264,15 +329,16 @@ class VirtualEpisodes:
             count: number of virtual episodes.
             recorded: whether they all begin as the last real episode did.
         """
-        plant = self.twin.plant
+        plant, large_scale = self.twin.plant, self.config.large_scale
         if recorded:
             assert self.recorded is not None  # inputs are drawn once a whole episode is known
             initial_state = self.recorded.repeat(count, 1)
         else:
             initial_state = plant.draw_initial_state(count, self.generator)
-        if self.config.large_scale == "drawn":
+        if large_scale == "drawn":
             return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
-        return Scenario(initial_state, plant.with_previews(sample_experience(self.processes, count, self.generator)))
+        exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
+        return Scenario(initial_state, plant.with_previews(exogenous))
 
     @torch.no_grad()
     def cost(self, policy: nn.Module, episodes: Scenario) -> float:
