@@ -6,6 +6,7 @@ step of the simulator. What is in the folder is not done again.
 """
 
 import argparse
+import ast
 import math
 import shlex
 import statistics
@@ -110,20 +111,17 @@ def rosco_flown(plant, seed, **tuning):
 
 
 def learned(options, seed, folder, winds):
-    """Means over episodes of the live policy of a training."""
+    """Means over winds, given by their seeds, of the live policy of a training."""
     words = ("--task", "engineering", *shlex.split(options))
     run = load_run(train("wind_turbine", words, seed, folder / "run"))
     policy = run.policy(run.live)
-    seeds = [episode_seed(UNSEEN_SEED, number) for number in range(winds)]
-    return mean_over([measured(policy_flown(run.plant, policy, each)) for each in seeds])
+    return mean_over([measured(policy_flown(run.plant, policy, wind)) for wind in winds])
 
 
 def tuned(options, winds):
-    """Means over episodes of ROSCO's controller with parameters such as ``PS_Mode=0 omega_pc=0.3``."""
-    tuning = {name: float(value) for name, _, value in (each.partition("=") for each in shlex.split(options))}
-    tuning = {name: int(value) if name.endswith("Mode") else value for name, value in tuning.items()}
-    seeds = [episode_seed(UNSEEN_SEED, number) for number in range(winds)]
-    return mean_over([measured(rosco_flown(WindTurbine(), seed, **tuning)) for seed in seeds])
+    """Means over winds of ROSCO's controller with parameters such as ``PS_Mode=0 omega_pc=0.3``."""
+    tuning = {name: ast.literal_eval(value) for name, value in (each.split("=") for each in shlex.split(options))}
+    return mean_over([measured(rosco_flown(WindTurbine(), wind, **tuning)) for wind in winds])
 
 
 def row(name, results):
@@ -139,21 +137,22 @@ def main():
     parser.add_argument("--also-seeds", type=int, default=1, help="seeds of each training with further options")
     parser.add_argument("--tuning", action="append", default=[], help="parameters of ROSCO: 'PS_Mode=0 omega_pc=0.3'")
     parser.add_argument("--winds", type=int, default=20)
+    parser.add_argument("--first-wind", type=int, default=20, help="0 to 19 and 40 to 59 chose the weights of the page")
     parser.add_argument("--folder", type=Path, default=Path("runs/rosco_peer"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(f"| controller | seeds | {' | '.join(MEASURES)} |")
     print("|---" * (2 + len(MEASURES)) + "|")
-    file = f"winds-{options.winds}.json"
+    numbers = range(options.first_wind, options.first_wind + options.winds)
+    winds, file = [episode_seed(UNSEEN_SEED, number) for number in numbers], f"winds-{numbers[0]}-{numbers[-1]}.json"
     for given in (*TUNINGS, *options.tuning):
         name = f"ROSCO {given}".strip()
-        result = kept(options.folder / name / file, partial(tuned, given, options.winds))
+        result = kept(options.folder / name / file, partial(tuned, given, winds))
         print(row(name, [result]), flush=True)
     for given, seeds in (("", options.seeds), *((each, options.also_seeds) for each in options.also)):
         folders = [options.folder / (given or "default") / str(seed) for seed in range(seeds)]
         results = [
-            kept(folder / file, partial(learned, given, seed, folder, options.winds))
-            for seed, folder in enumerate(folders)
+            kept(folder / file, partial(learned, given, seed, folder, winds)) for seed, folder in enumerate(folders)
         ]
         if not results:
             continue

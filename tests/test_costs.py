@@ -31,6 +31,7 @@ def test_the_engineering_cost_term_by_term():
     still = (full, 5.0)
     assert turbine_cost(RATED, full, 5.0, still) == pytest.approx(0.0, abs=1e-12)
     assert turbine_cost(RATED, 0.25 * full, 5.0, still) == pytest.approx(0.75, rel=1e-12)
+    assert turbine_cost(RATED, 0.25 * full, 5.0, still, power_demand=0.5) == pytest.approx(0.5, rel=1e-12)
     # Power above rated earns nothing, and costs the square of its share; a speed error is in units of 20 rad/s.
     excess, over = 0.1**2, (0.1 * RATED / 20.0) ** 2
     assert turbine_cost(1.1 * RATED, full, 5.0, still) == pytest.approx(excess + over, rel=1e-9)

@@ -15,7 +15,7 @@ from rt_torchrl.envs.wind_turbine import unknown
 from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
 from rt_torchrl.envs.wind_turbine.disturbances import CUT_IN_WIND, KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
-from rt_torchrl.options import NotNegative, configuration
+from rt_torchrl.options import NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import between, lag, require_stable_step
@@ -444,7 +444,7 @@ class EngineeringCost:
     r"""What the operator of a turbine pays for: energy that is not made, overspeed, and wear of the actuators.
 
     .. math::
-        L_a = 1 - \frac{\min(P, P_r)}{P_r} + \Big(\frac{(P - P_r)_+}{P_r}\Big)^2
+        L_a = 1 - \frac{\min(P, P_d)}{P_d} + \Big(\frac{(P - P_d)_+}{P_d}\Big)^2
         + \Big(\frac{(\omega_g - \omega_{rated})_+}{\gamma_1}\Big)^2
         + w_O\Big(\frac{(\omega_g - \omega_{max})_+}{\gamma_1}\Big)^2
         + w_U\,\sigma\Big(\frac{u - u_{rated}}{0.5\,\mathrm{m/s}}\Big)
@@ -452,27 +452,30 @@ class EngineeringCost:
         + w_\beta\Big(\frac{\dot\beta}{1\,\mathrm{deg/s}}\Big)^2
         + w_\tau\Big(\frac{\dot\tau_g}{15\,\mathrm{kN\,m/s}}\Big)^2
 
-    with the power P at the generator shaft, the drivetrain's rated power P_r = 5.297 MW, ω_max = 1.1 ω_rated, the wind
-    u, and the rates of the actions that are applied. Power above rated earns nothing. Without w_U a policy lets the
-    rotor give its energy where the wind falls short.
+    with the power P at the generator shaft, the demanded power P_d, by default the drivetrain's rated 5.297 MW, ω_max =
+    1.1 ω_rated, the wind u, and the rates of the actions that are applied. Power above P_d earns nothing. Without w_U a
+    policy lets the rotor give its energy where the wind falls short.
 
     Args:
         underspeed: weight w_U of speed below rated in wind above rated.
         pitch_rate: weight w_β of the blades' rate.
         torque_rate: weight w_τ of the torque's rate.
+        power_demand: P_d as a share of rated power [-]. Less than one derates the turbine.
 
     Raises:
-        ValueError: if a weight is negative.
+        ValueError: if a weight is negative, or no power is demanded.
     """
 
     underspeed: NotNegative = 0.0
     pitch_rate: NotNegative = 0.01
     torque_rate: NotNegative = 0.01
+    power_demand: Positive = 1.0
     overshoot: ClassVar[float] = 10.0
     """Weight w_O of speed above 110 % of rated, a soft constraint."""
 
     def __call__(self, plant: WindTurbine, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
-        share = plant.generator_power(state, applied) / (plant.actions[0].high * plant.rated_generator_speed)
+        demand = self.power_demand * plant.actions[0].high * plant.rated_generator_speed
+        share = plant.generator_power(state, applied) / demand
         above = (plant.gear_ratio * state[..., 0] - plant.rated_generator_speed) / plant.speed_error_scale
         beyond = above - 0.1 * plant.rated_generator_speed / plant.speed_error_scale
         windy = torch.sigmoid((exogenous[..., 0] - plant.rated_wind_speed) / 0.5)
