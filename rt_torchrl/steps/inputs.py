@@ -137,9 +137,9 @@ def sample_experience(
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
     chosen = torch.cat(order)[:count].tolist()
-    larges = mixed([one.mean for one in processes], count, generator) if large_scale == "mixed" else None
-    each = [None] * count if larges is None else larges.split(1)
-    return torch.cat([processes[k].sample(1, generator, large=large) for k, large in zip(chosen, each, strict=True)])
+    larges = mixed([process.mean for process in processes], count, generator) if large_scale == "mixed" else None
+    rows = zip(chosen, [None] * count if larges is None else larges.split(1), strict=True)
+    return torch.cat([processes[k].sample(1, generator, large=large) for k, large in rows])
 
 
 def mixed(
@@ -170,12 +170,12 @@ def mixed(
     m = len(larges)
     if m < ENOUGH:
         return None
-    met = torch.stack(list(larges))
-    centre = met.mean(0)
-    changes = (met - centre) / (met - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
+    stacked = torch.stack(list(larges))
+    centre = stacked.mean(0)
+    changes = (stacked - centre) / (stacked - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
     components = torch.linalg.eigh(changes.flatten(1) @ changes.flatten(1).T).eigenvectors.flip(1)
-    weights = _quasi_normal(count, m, generator).to(met) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
-    return centre + torch.einsum("cm,mnz->cnz", weights, met - centre)
+    weights = _quasi_normal(count, m, generator).to(stacked) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
+    return centre + torch.einsum("cm,mnz->cnz", weights, stacked - centre)
 
 
 def _quasi_normal(count: int, dimensions: int, generator: torch.Generator) -> Float[Tensor, "{count} {dimensions}"]:
