@@ -170,6 +170,15 @@ def test_the_decay_of_a_first_order_process_is_found():
     torch.testing.assert_close(found.time, torch.tensor([6.0, 30.0]).double(), rtol=0.1, atol=0.0)
 
 
+def test_inputs_that_stand_still_or_wander_in_the_records_are_held():
+    """Set points of other episodes are not forecast to decay to those that have been met."""
+    noise = torch.randn(20, 200, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    still = (0.1 + noise[:, :1]).expand(-1, 200)
+    records = torch.stack([still, 100.0 * still + noise.cumsum(1), noise], -1)
+    assert Decaying.fitted(records, dt=0.5, horizon=20.0).time.isinf().tolist() == [True, True, False]
+    assert Decaying.fitted(records[:1, :, :1], dt=0.5, horizon=20.0).time.isinf().all()
+
+
 def matrices(plant):
     """The interval as s⁺ = A s + B a + D z, by the four terms of Runge and Kutta's scheme, and the weights of L_a."""
     continuous = np.array(plant.A) + np.array(plant.true_closure)

@@ -1,5 +1,6 @@
 """Forecasts of the exogenous inputs over a planning horizon."""
 
+import math
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -50,7 +51,7 @@ class Decaying(nn.Module):
 
     @classmethod
     def fitted(cls, records: Inputs, *, dt: float, horizon: float) -> "Decaying":
-        r"""The decay times of the least mean squared error of the forecast over the horizon.
+        r"""The decay times of the least mean squared error of the forecast over the horizon; infinite if none is better.
 
         .. math::
             \sum_{j\le N}\mathrm E(z_{k+j} - \hat z_{k+j})^2 = \sum_{j\le N}\Gamma_0 - 2q^j\Gamma_j + q^{2j}\Gamma_0
@@ -71,8 +72,8 @@ class Decaying(nn.Module):
                 f"horizon={horizon} s is {lags} control intervals; it must be at least one and below the "
                 f"{records.shape[1]} of the records."
             )
-        mean = records.mean((0, 1))
-        spectrum = np.abs(np.fft.rfft((records - mean).numpy(), 2 * records.shape[1], axis=1)) ** 2
+        mean, changes = records.mean((0, 1)), records - records[0, 0]  # which are exactly zero where nothing moves
+        spectrum = np.abs(np.fft.rfft((changes - changes.mean((0, 1))).numpy(), 2 * records.shape[1], axis=1)) ** 2
         number = records.shape[1] - np.arange(lags + 1)
         covariance = np.fft.irfft(spectrum.mean(0), axis=0)[: lags + 1] / number[:, None]
         times = [_decay_time(column, dt, records.shape[1] * dt) for column in covariance.T]
@@ -84,7 +85,7 @@ class Decaying(nn.Module):
 
 
 def _decay_time(covariance: Float[np.ndarray, " lags"], dt: float, longest: float) -> float:
-    """The decay time [s] of the least forecast error, between a tenth of an interval and the length of a record."""
+    """The decay time [s] of the least forecast error, between a tenth of an interval and a record, or infinite."""
     from scipy.optimize import minimize_scalar  # here, because it takes a second to load and --help need not wait
 
     steps = np.arange(len(covariance))
@@ -97,4 +98,5 @@ def _decay_time(covariance: Float[np.ndarray, " lags"], dt: float, longest: floa
     grid = np.linspace(*ends, 60)
     k = int(np.argmin([error(x) for x in grid]))
     around = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
-    return float(np.exp(minimize_scalar(error, bounds=around, method="bounded").x))
+    best = minimize_scalar(error, bounds=around, method="bounded")
+    return math.inf if error(math.inf) <= best.fun else float(np.exp(best.x))
