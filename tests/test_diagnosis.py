@@ -22,7 +22,7 @@ from rt_torchrl import (
 from rt_torchrl.options import configuration
 from rt_torchrl.runs.diagnosis import Reason
 
-CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST = range(6)
+CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST, CHATTER = range(7)
 
 
 class Spring(LinearGain):
@@ -95,7 +95,7 @@ def rewrite(run, change):
 def test_a_run_that_ended_well_has_no_reason_and_the_user_judges_that_it_acts_more(run):
     reasons = diagnose(run)
     # Ten episodes from random initial states scatter too much to compare them with those of the plan.
-    assert [reason.holds for reason in reasons] == [False, False, False, False, None, None]
+    assert [reason.holds for reason in reasons] == [False, False, False, False, None, None, False]
     assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
     evidence = reasons[COST].evidence
     assert "judge whether it is better: mean force [N]" in evidence and "against 0 of still" in evidence
@@ -109,6 +109,13 @@ def test_a_policy_above_the_least_cost_of_its_class_is_in_a_poor_minimum(run):
         gain.mul_(0.3)
     reason = diagnose(run)[MINIMUM]
     assert reason.holds and "with the best weights" in reason.evidence
+
+
+def test_a_gain_that_turns_the_action_over_in_every_interval_chatters(run):
+    with torch.no_grad():
+        run.policy("model_based").gain.copy_(torch.tensor([[0.0, 30.0]]))
+    reason = diagnose(run, episodes=2)[CHATTER]
+    assert reason.holds and "force changes by more than half its range" in reason.evidence
 
 
 def test_a_class_that_sees_too_little_is_too_small(tmp_path):

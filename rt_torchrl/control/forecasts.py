@@ -51,7 +51,7 @@ class Decaying(nn.Module):
 
     @classmethod
     def fitted(cls, records: Inputs, *, dt: float, horizon: float) -> "Decaying":
-        r"""The decay times of the least mean squared error of the forecast over the horizon; infinite if none is better.
+        r"""The decay times of the least mean squared error of the forecast over the horizon, or infinite ones.
 
         .. math::
             \sum_{j\le N}\mathrm E(z_{k+j} - \hat z_{k+j})^2 = \sum_{j\le N}\Gamma_0 - 2q^j\Gamma_j + q^{2j}\Gamma_0

@@ -1,4 +1,4 @@
-"""Good twin, poor policy: which of six reasons holds in a finished run, and what says so."""
+"""Good twin, poor policy: which of seven reasons holds in a finished run, and what says so."""
 
 import copy
 import math
@@ -9,14 +9,19 @@ import torch
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Costs
+from rt_torchrl.plants.signal import bounds
 from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.runs.metrics import costs_at_the_end
 from rt_torchrl.steps.belief import NOISE
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 MINIMUM, CLASS, INPUTS, MERIT = 0.03, 0.1, 0.2, 0.2
 """Shares of J_a from which a better minimum, a better controller and dearer inputs count, and share of a merit."""
+JUMP, OFTEN = 0.5, 0.2
+"""Change of an action from one interval to the next, as a share of its range, and share of such changes that count."""
 
 
 class Reason(NamedTuple):
@@ -51,7 +56,8 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
     policy, believed = run.policy(run.live), run.twin.believed
     unseen = UnseenEpisodes(believed.plant, episodes)
     unseen.closure, unseen.physics = believed.closure, run.physics
-    validation, costs = unseen.validation(), unseen.control_costs(policy)
+    validation, flown = unseen.validation(), unseen.fly(policy)
+    costs = unseen.judge(flown).control_costs
     assert validation is not None  # the closure of a twin is known
     best, minimum = _minimum(run, unseen, validation, costs)
     return [
@@ -61,6 +67,7 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
         _class(run, unseen, validation, best),
         _inputs(run, costs),
         _merits(run),
+        _chattering(believed.plant, flown),
     ]
 
 
@@ -177,3 +184,14 @@ def _merits(run: LoadedRun) -> Reason:
     if differences:
         return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(differences)}", remedy)
     return Reason(name, False, "it is cheaper than no classical controller, or alike in every merit", remedy)
+
+
+def _chattering(plant: Plant, flown: Trajectory) -> Reason:
+    """Whether an action jumps to and fro every few intervals, as in a limit cycle between the ends of its range."""
+    name, remedy = "the policy chatters", "a price on changes of the action in the cost, or a shorter dt"
+    low, high = bounds(plant.actions, device=flown.actions.device)
+    jumps = (flown.actions.diff(dim=1).abs() > JUMP * (high - low)).double().mean((0, 1))
+    worst = int(jumps.argmax())
+    share, action = 100.0 * jumps[worst].item(), plant.actions[worst].name
+    evidence = f"{action} changes by more than half its range in {share:.3g} % of the intervals on the twin"
+    return Reason(name, share > 100.0 * OFTEN, evidence, remedy)
