@@ -12,7 +12,7 @@ if __name__ == "__main__":
 from tyro.conf import Positional
 
 from rt_torchrl.atomic_file import make_folder
-from rt_torchrl.export.program import ONNX_PACKAGES, require_packages
+from rt_torchrl.export.program import require_onnx
 from rt_torchrl.options import Text
 
 FORMATS: dict[str, dict[str, Callable[..., float | None]]] = {
@@ -78,7 +78,7 @@ def main(config: Config) -> None:
     formats = config.formats or DEFAULT
     if "onnx" in formats:
         others = " ".join(kind for kind in formats if kind != "onnx") or " ".join(DEFAULT)
-        require_packages(ONNX_PACKAGES, f"leave it out by --formats {others}")
+        require_onnx(f"leave it out by --formats {others}")
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):

@@ -71,7 +71,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         ValueError: if a package of the extra ``export`` is missing, the policy does not fit the plant or has no ONNX
             form, onnxruntime cannot run the model, or the model does not agree with the policy.
     """
-    require_packages(ONNX_PACKAGES)
+    require_onnx()
     policy, name = detached(policy, plant), type(policy).__name__
     program = _traced(policy, plant)
     options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
@@ -139,17 +139,16 @@ def interface(plant: Plant) -> dict[str, Any]:
     }
 
 
-def require_packages(needed: Sequence[str], otherwise: str = "take the .pt2 program or C") -> None:
-    """Refuse to go on without packages of the extra ``export``.
+def require_onnx(otherwise: str = "take the .pt2 program or C") -> None:
+    """Refuse to go on without the packages of the extra ``export``.
 
     Args:
-        needed: names of the packages.
         otherwise: what can be done without them.
 
     Raises:
         ValueError: if a package is not installed.
     """
-    for package in needed:
+    for package in ONNX_PACKAGES:
         try:
             importlib.import_module(package)
         except ImportError as error:
@@ -163,9 +162,8 @@ def onnx_runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
     """A model as a function of a batch of observations.
 
     Raises:
-        ValueError: if onnxruntime is not installed, or cannot run the model.
+        ValueError: if onnxruntime cannot run the model.
     """
-    require_packages(["onnxruntime"])
     import onnxruntime
 
     try:

@@ -97,9 +97,7 @@ def _classical(run: LoadedRun) -> Reason:
     remedy = "more twinning.planner.iterations and realisations, observations of what that controller reads, or it"
     cost, known, where = costs_at_the_end(run.metrics["summary"])
     if cost is None or not known:
-        return Reason(
-            name, None, "no classical controller flew beside the policy, or the policy has no finite cost", remedy
-        )
+        return Reason(name, None, "no classical controller flew beside the policy, or it has no finite cost", remedy)
     best = min(known, key=known.__getitem__)
     evidence = f"{best} costs {known[best]:.4g}, the policy {cost:.4g} ({where})"
     return Reason(name, known[best] < cost, evidence, remedy)
@@ -118,10 +116,8 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes,
     def drawn(generator: torch.Generator) -> torch.nn.Module:
         return run.config.make_policies(run.physics, generator)[role]
 
-    def present(generator: torch.Generator) -> torch.nn.Module:
-        return copy.deepcopy(policy)
-
-    candidates = exact_optimum(validation, drawn), exact_optimum(validation, present, starts=1)
+    present = exact_optimum(validation, lambda generator: copy.deepcopy(policy), starts=1)
+    candidates = exact_optimum(validation, drawn), present
     best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
     evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
     # A search that ends far above the policy is poor itself, and says nothing of the plan.
@@ -192,6 +188,6 @@ def _chattering(plant: Plant, flown: Trajectory) -> Reason:
     low, high = bounds(plant.actions, device=flown.actions.device)
     jumps = (flown.actions.diff(dim=1).abs() > JUMP * (high - low)).double().mean((0, 1))
     worst = int(jumps.argmax())
-    share, action = 100.0 * jumps[worst].item(), plant.actions[worst].name
-    evidence = f"{action} changes by more than half its range in {share:.3g} % of the intervals on the twin"
-    return Reason(name, share > 100.0 * OFTEN, evidence, remedy)
+    where = f"in {100.0 * jumps[worst]:.3g} % of the intervals on the twin"
+    evidence = f"{plant.actions[worst].name} changes by more than half its range {where}"
+    return Reason(name, bool(jumps[worst] > OFTEN), evidence, remedy)

@@ -212,7 +212,5 @@ def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int)
 
 def paid_before(folder: Path) -> list[float | None]:
     """J_a of the flights that earlier ends of a resumed run have made; null stands for one that is not finite."""
-    if not (folder / "metrics.json").is_file():
-        return []
-    before: list[float | None] = read_metrics(folder)["summary"]["cost_of_learning"].get("judging", [])
-    return before
+    ended = (folder / "metrics.json").is_file()
+    return list(read_metrics(folder)["summary"]["cost_of_learning"].get("judging", [])) if ended else []

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import vector_to_parameters
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import OTHER_UNITS
@@ -226,8 +226,7 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     if not mistakes and not explained:
         mistakes = _at_first(fit, flown) or _better(present, fit, flown)
     doubts = (*_doubts(plant, present), *_strange_starts(plant, flown), *_moving_inputs(plant, flown))
-    doubts = () if mistakes else doubts
-    return Wiring(plant, present, moved, tuple(mistakes), doubts)
+    return Wiring(plant, present, moved, tuple(mistakes), () if mistakes else doubts)
 
 
 def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
@@ -373,10 +372,6 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
     return Flown._make([*(torch.cat(columns) for columns in list(zip(*parts, strict=True))[:7]), 1.0, 1.0])
 
 
-def _movement(plant: Plant, flown: Flown) -> Float[Tensor, "n n_s"]:
-    return differences(plant.states, flown.ends, flown.states)
-
-
 class _Fit:
     """One-step predictions of a twin, whose coefficients are fitted to a wiring.
 
@@ -389,8 +384,7 @@ class _Fit:
         self.plant, self._closure = plant, copy.deepcopy(closure).cpu()
         self._twin = DigitalTwin(plant, self._closure)
         self._weights = [weight for weight in self._closure.parameters() if weight.requires_grad]
-        guess = parameters_to_vector(self._weights) if self._weights else torch.zeros(0, dtype=torch.float64)
-        self.guess = guess.detach().clone()
+        self.guess = torch.cat([torch.zeros(0).double(), *(weight.detach().flatten() for weight in self._weights)])
 
     def suspicion(self, mistake: str, flown: Flown, evaluations: int = EVALUATIONS) -> Suspicion:
         """A wiring with the coefficients that fit it best after so many evaluations."""
@@ -402,7 +396,7 @@ class _Fit:
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
-        size = _movement(self.plant, flown).square().mean(0).sqrt()
+        size = differences(self.plant.states, flown.ends, flown.states).square().mean(0).sqrt()
         return size, size > STILL * (1.0 + flown.states.abs().amax(0))
 
     def _fitted(self, flown: Flown, evaluations: int) -> Tensor:
@@ -437,8 +431,8 @@ class _Fit:
             return nan, nan[..., None].expand(-1, -1, len(weights))
         share = flown.signs * torch.full((flown.states.shape[-1],), flown.ratio / steps, dtype=torch.float64)
         movement = share * differences(self.plant.states, ends[:, -1], flown.states)
-        error = _movement(self.plant, flown) - movement
-        return differences(self.plant.states, error, torch.zeros_like(error)), share[:, None] * slopes[:, -1]
+        error = differences(self.plant.states, flown.ends - flown.states, movement)
+        return error, share[:, None] * slopes[:, -1]
 
 
 def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
