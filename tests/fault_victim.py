@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from small_runs import SMALL, small_run
+from small_runs import FULL, small_run
 
 from rt_torchrl import Run, RunConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
@@ -32,7 +32,7 @@ def shipped_run(name, folder, **options):
     """A training on a shipped plant that takes seconds."""
     make_plant, controller = SHIPPED[name]
     start = "random" if controller is None else "controller"
-    shared = {"episodes": EPISODES, "unseen": 2, "start": start, "threads": 1, "twinning": SMALL}
+    shared = {"episodes": EPISODES, "unseen": 2, "start": start, "threads": 1, "twinning": FULL}
     return Run(RunConfig(log_dir=folder, **shared | QUICK | options), make_plant(), first=controller)
 
 

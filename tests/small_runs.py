@@ -1,11 +1,13 @@
 """Whole runs on the oracle plant that take seconds."""
 
+import dataclasses
+
 import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl import ExplorationConfig, HypothesesConfig, LearnerConfig, RefereeConfig, Run, RunConfig, TwinningConfig
 
-SMALL = TwinningConfig(
+FULL = TwinningConfig(
     hypotheses=HypothesesConfig(which=("none",)),  # a twin that has hardly learned would call for them
     realisations=2,
     virtual_episodes=2,
@@ -14,6 +16,10 @@ SMALL = TwinningConfig(
     # No patience, so that swaps and clones happen within the few episodes of a test.
     referee=RefereeConfig(patience=0, clone_patience=0),
 )
+IDLE = LearnerConfig(critic_iterations=0, actor_iterations=0, batch_size=8)
+"""A learner without iterations, whose tracing takes longer than all else in a short episode."""
+SMALL = dataclasses.replace(FULL, learner=IDLE)
+"""Options of small runs: all steps, and all but the model-free policy's iterations."""
 
 
 @torch.no_grad()

@@ -1,12 +1,11 @@
 """The six steps together, on the linear-quadratic plant, where the right closure and the right gain are known."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from printed_commands import documented
+from small_runs import IDLE
 from tensordict import TensorDict
 
 from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, PlantEnv, ReinforcementTwinning
@@ -25,8 +24,6 @@ STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 
 
 LEARNING = LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16)
-IDLE = dataclasses.replace(LEARNING, critic_iterations=0, actor_iterations=0)
-"""A learner without iterations, whose tracing takes longer than all else in a short episode."""
 
 
 def twinning(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import SMALL
+from small_runs import FULL, SMALL
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -180,13 +180,13 @@ ONE_OF_EACH = dataclasses.replace(
     SMALL,
     assimilation=AssimilationConfig(iterations=1),
     planner=PlannerConfig(iterations=1),
-    learner=dataclasses.replace(SMALL.learner, critic_iterations=2, actor_iterations=1),
+    learner=dataclasses.replace(FULL.learner, critic_iterations=2, actor_iterations=1),
 )
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
 )
 NEURAL = {"closure": "mlp", "policy": "mlp", "hidden": (4,)}
-TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
+TD3 = dataclasses.replace(FULL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
 
 
 @pytest.fixture

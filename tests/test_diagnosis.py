@@ -1,6 +1,7 @@
 """Why a policy is poor: each reason in a run of which it is true, and in one of which it is not."""
 
 import json
+import shutil
 from dataclasses import field
 from typing import Literal
 
@@ -80,9 +81,15 @@ def finished(folder, **options):
     return load_run(folder, Config)
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return finished(tmp_path_factory.mktemp("trained") / "run").folder
+
+
 @pytest.fixture
-def run(tmp_path):
-    return finished(tmp_path)
+def run(trained, tmp_path):
+    """A run of its own, whose results may be rewritten."""
+    return load_run(shutil.copytree(trained, tmp_path / "run"), Config)
 
 
 def rewrite(run, change):

@@ -8,12 +8,17 @@ import matplotlib.colors
 import numpy as np
 import pytest
 import torch
-from figure_reading import clipped_texts, collisions, draw, line
+from figure_reading import clipped_texts, collisions, draw, line, panel, snapshot_of
 from linear_quadratic import LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
+from small_runs import IDLE
 
-from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Signal, Snapshot, figures
+from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Signal, Snapshot, Trajectory, figures
+from rt_torchrl.envs.cryogenic_tank import figures as tank_figures
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing import figures as drone_figures
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine import figures as turbine_figures
@@ -23,9 +28,9 @@ from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import flights
 from rt_torchrl.figures.style import ROLES
-from rt_torchrl.figures.training import RESOLUTION, visited_observations
+from rt_torchrl.figures.training import RESOLUTION, closure_weights, visited_observations
 from rt_torchrl.runs.results import episode_record
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, RefereeConfig, TwinningConfig
 
 EVERYWHERE = {"states", "policy_contours", "learning_curves"}
 
@@ -39,7 +44,7 @@ def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
         arm=arm,
         realisations=2,
         virtual_episodes=2,
-        learner=LearnerConfig(critic_iterations=2, actor_iterations=2, batch_size=8),
+        learner=IDLE,
         assimilation=AssimilationConfig(iterations=2),
         planner=PlannerConfig(iterations=1),
         referee=RefereeConfig(rule="decision_tree"),
@@ -259,3 +264,165 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
             assert np.array_equal(shown[column].get_ydata(), expected)
             assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
             assert (np.abs(shown[column].get_xdata() - column) < 0.3).all()
+
+
+# The tank's figures against the numbers they are drawn from, on six hours in orbit.
+
+
+FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
+TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}
+
+
+@pytest.fixture(scope="module")
+def tank() -> Snapshot:
+    """The real tank, and a twin whose coefficients are some percent off."""
+    twin = ConstantCoefficients(torch.tensor([found[-1] for found in FOUND.values()], dtype=torch.float64))
+    episodes = [{"closure": {name: found[k] for name, found in FOUND.items()}} for k in range(2)]
+    return snapshot_of(CryogenicTank(horizon=6 * 3600.0), twin, shift=10.0, episodes=episodes)
+
+
+def test_tank_is_the_record(tank):
+    figure, plant = tank_figures.tank(tank), tank.plant
+    actions = tank.record.actions
+    for name, states, K_JT in (("real", tank.record.states, 500e9), ("twin", tank.replay, 480e9)):
+        T_s, V_l, p = states[:-1].unbind(-1)
+        fluid, drop = plant.saturation(p), actions[:, 0]
+        flow = (drop / K_JT).sqrt()  # tens of kPa, far above the laminar drop of 100 Pa
+        expected = {
+            "pressure": (1e-3 * p, 1e-12),
+            "liquid mass": (V_l * fluid.rho_l, 1e-12),
+            "wall-fluid temperature difference": (T_s - fluid.T, 1e-9),
+            "vent flow": (1e3 * flow, 1e-5),
+            "vented mass": (30.0 * (flow.cumsum(0) - flow), 1e-5),
+        }
+        for label, (values, tolerance) in expected.items():
+            drawn = line(panel(figure, label), name).get_ydata()
+            np.testing.assert_allclose(drawn, values.numpy(), rtol=tolerance, atol=1e-12, err_msg=label)
+    load = panel(figure, "heat load")
+    assert np.array_equal(line(load, "real").get_ydata(), tank.record.exogenous[:, 0].numpy())
+    assert np.array_equal(line(load, "large scale (SVR)").get_ydata(), tank.large_scale[:, 0].numpy())
+    units = [ax.get_title(loc="left").split("[")[1] for ax in figure.axes]
+    assert units == ["kPa]", "kg]", "kg]", "K]", "g/s]", "W]"]
+    assert load.get_xlabel() == "time [h]"
+    assert load.get_xlim() == pytest.approx((0.0, 6.0), rel=1e-12)
+
+
+def test_long_records_are_thinned_to_mean_and_range(tank):
+    # Twice the six hours and a bit: groups of three, the last with one sample.
+    record = tank.record
+    n = 2 * len(record.actions) + 1
+    repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in record[:3]]
+    states = torch.cat([repeated[0], repeated[0][-1:]])
+    record = Trajectory(states, *repeated[1:])
+    long = replace(tank, record=record, replay=states, large_scale=repeated[2], realisations=None)
+    figure = tank_figures.tank(long)
+    load, values = panel(figure, "heat load"), repeated[2][:, 0].numpy()
+    drawn = line(load, "real").get_ydata()
+    assert n % 3 == 1 and len(drawn) == (n + 2) // 3 <= tank_figures.POINTS
+    assert drawn[5] == pytest.approx(values[15:18].mean(), rel=1e-12)
+    assert drawn[-1] == values[-1]
+    vertices = load.collections[0].get_paths()[0].vertices[:, 1]
+    assert (vertices.min(), vertices.max()) == (values.min(), values.max())
+    assert any("every 1.5 min" in text for text in draw(figure))
+
+
+def test_heat_exchanger_of_each_closure(tank):
+    figure, plant = tank_figures.heat_exchanger(tank), tank.plant
+    heat, held, share = figure.axes
+    closures = {"true": plant.closure, "twin": tank.closure, "initial twin": tank.initial_closure}
+    calm = torch.zeros(1, 1, dtype=torch.float64)
+    for name, closure in closures.items():
+        drop, load = line(held, name).get_xdata()[150], line(held, name).get_ydata()[150]
+        state = plant.state_at(torch.tensor([500e3], dtype=torch.float64))
+        action = torch.tensor([[1e3 * drop]], dtype=torch.float64)
+        assert line(heat, name).get_ydata()[150] == pytest.approx(plant.vent(state, action, closure).heat.item())
+        # At the held load, which a wall with T_s - T = Q/(U_s A_s) hands to the fluid, the pressure stands still: its
+        # rate is that of rounding, where the load alone makes some 1e-3 Pa/s.
+        U_s = closure.named_coefficients()["U_s"].item()
+        state[:, 0] += load / (U_s * plant.wall_area)
+        assert abs(plant.vector_field(calm[0], state, action, calm, closure)[0, 2].item()) < 1e-8
+    mean = tank.record.exogenous.mean().item()
+    assert line(held, "mean load of the last episode").get_ydata()[0] == mean
+    assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert all("[W]" in ax.get_title(loc="left") for ax in (heat, held))
+    assert share.get_xlabel().endswith("[kPa]")
+
+
+def test_closure_weights_with_truth_start_and_units(tank):
+    figure = closure_weights(tank)
+    for ax, (name, found) in zip(figure.axes, FOUND.items(), strict=True):
+        assert list(line(ax, "twin").get_ydata()) == found
+        assert line(ax, "true").get_ydata()[0] == pytest.approx(TRUE[name], rel=1e-14)
+        start = tank.initial_closure.named_coefficients()[name].item()
+        assert line(ax, "start").get_ydata()[0] == start
+        assert ax.get_yscale() == "log" and ax.get_title(loc="left").splitlines()[0].endswith("]")
+        assert ax.get_title(loc="right") == f"{100 * (found[-1] / TRUE[name] - 1):+.2g} %"
+
+
+# The drone's figures against the numbers they are drawn from, on a short flight.
+
+
+@pytest.fixture(scope="module")
+def drone() -> Snapshot:
+    """Four beats of the real drone, and of a twin that has half the lift."""
+    twin = QuasiSteadyPolar(torch.tensor([0.86, 0.05, 1.5], dtype=torch.float64))
+    return snapshot_of(FlappingWing(horizon=0.2), twin, shift=0.1, realisations=False)
+
+
+def test_collectors_path_is_the_record(drone):
+    figure = drone_figures.flight_path(drone)
+    plant, real = drone.plant, drone.record.states
+    path, wind, distance = (panel(figure, name) for name in ("vertical plane", *_side_labels(plant)))
+    for name, states in (("real", real), ("twin", drone.replay)):
+        assert np.array_equal(line(path, name).get_xydata(), states[:, :2].numpy())
+        away = torch.hypot(states[:, 0] - 5.0, states[:, 1] - 5.0)
+        np.testing.assert_allclose(line(distance, name).get_ydata(), away.numpy(), rtol=1e-14)
+    assert line(path, "target").get_xydata().tolist() == [[5.0, 5.0]]
+    assert (path.get_xlabel(), path.get_ylabel()) == (plant.states[0].label, plant.states[1].label)
+    assert path.get_aspect() == 1.0
+    assert same(line(wind, "recorded"), drone.record.exogenous[:, 0])
+    assert same(line(wind, "large scale (SVR)"), drone.large_scale[:, 0])
+    assert 2.554 in [entry.get_ydata()[0] for entry in wind.lines]
+    assert distance.get_xlabel() == "time [s]"
+
+
+def _side_labels(plant):
+    return plant.inputs[0].label, "distance to the target [m]"
+
+
+def test_polars_are_those_of_the_closures(drone):
+    figure = drone_figures.polars(drone)
+    lift, drag, share = figure.axes
+    angle = line(lift, "true").get_xdata()
+    alpha = np.radians(angle)
+    laws = {"true": (1.71, 0.043, 1.595), "twin": (0.86, 0.05, 1.5)}
+    laws["initial twin"] = drone.initial_closure.coefficients.tolist()
+    for name, (a, b, c) in laws.items():
+        # Curves of order one, exact to rounding.
+        np.testing.assert_allclose(line(lift, name).get_ydata(), a * np.sin(2 * alpha), atol=1e-13)
+        np.testing.assert_allclose(line(drag, name).get_ydata(), b + c * (1 - np.cos(2 * alpha)), atol=1e-13)
+    assert "twin: a = 0.86, b = 0.05, c = 1.5" in figure._suptitle.get_text()
+    assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert [ax.get_title(loc="left")[-3:] for ax in (lift, drag)] == ["[-]", "[-]"]
+    assert share.get_xlabel().endswith("[deg]")
+
+
+def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(drone):
+    figure = drone_figures.control_surfaces(drone)
+    contours = [ax for ax in figure.axes if ax.get_title(loc="left") in ("model-based", "model-free")]
+    assert len(contours) == 8
+    planes = {(ax.get_xlabel(), ax.get_ylabel()) for ax in contours if ax.get_ylabel()}
+    e_x, e_z, de_x, de_z = (signal.label for signal in drone.plant.observations)
+    assert planes == {(e_x, de_x), (e_z, de_z)}
+    for ax in contours:
+        k = contours.index(ax) % 4 // 2
+        policy = drone.policies[ax.get_title(loc="left").replace("-", "_")]
+        filled, observation = ax.collections[0], torch.zeros(4, dtype=torch.float64)
+        plane = [0, 2] if ax.get_xlabel() == e_x else [1, 3]
+        corner = [ax.get_xlim()[0], ax.get_ylim()[1]]
+        observation[plane] = torch.tensor(corner, dtype=torch.float64)
+        value = policy(observation)[k].item()
+        level = np.searchsorted(filled.levels, value) - 1
+        # The corner is a vertex of the band that holds its value.
+        distance = np.linalg.norm(filled.get_paths()[level].vertices - corner, axis=1)
+        assert distance.min() < 1e-9

@@ -19,13 +19,12 @@ from rt_torchrl.trajectories.rollout import Rollout
 PLANTS = {
     "linear_quadratic": lambda: LinearQuadratic(dt=0.1, horizon=4.0),
     # Below rated wind, between the limits of the reference speed: the field has no kink on the way.
-    "wind_turbine": lambda: WindTurbine(horizon=30.0, wind=KaimalWind(mean=8.0, intensity=0.1)),
-    # Half a beat, 50 steps.
-    "flapping_wing": lambda: FlappingWing(horizon=0.025),
-    "cryogenic_tank": lambda: CryogenicTank(horizon=900.0),
+    "wind_turbine": lambda: WindTurbine(horizon=10.0, wind=KaimalWind(mean=8.0, intensity=0.1)),
+    # A fifth of a beat, 20 steps.
+    "flapping_wing": lambda: FlappingWing(horizon=0.01),
     # Its terminal cost enters by the first state and the last.
-    "tank with an end": lambda: CryogenicTank(horizon=900.0, cost=PressureCost(end=43_200.0)),
-    "pendulum": lambda: Pendulum(horizon=2.0),
+    "cryogenic_tank": lambda: CryogenicTank(horizon=300.0, cost=PressureCost(end=43_200.0)),
+    "pendulum": lambda: Pendulum(horizon=1.0),
 }
 # Number of outputs of a perceptron that stands in for a plant's closure, and their offset. The tank's coefficients, of
 # sizes 50 to 5e11, are beyond one.

@@ -1,13 +1,35 @@
 """What a policy observes: any choice of a plant's measurements, each scaled to order one; and previews of the wind."""
 
+import json
+import math
+from pathlib import Path
+
 import pytest
 import torch
+from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import double, seeded
+from test_classical import PD
+from test_export_recipe import RECIPES
 
-from rt_torchrl import DigitalTwin, ExogenousConfig, Rollout, SaturatedAffine, Trajectory, check_plant, shipped_plants
+from rt_torchrl import (
+    DigitalTwin,
+    ExogenousConfig,
+    Measurement,
+    Phase,
+    Rollout,
+    RunConfig,
+    SaturatedAffine,
+    Signal,
+    Trajectory,
+    check_plant,
+    shipped_plants,
+)
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.run import Run
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 CHOICES = [(name, kind, which) for name, kind in shipped_plants().items() for which in kind.observation_sets]
@@ -100,3 +122,151 @@ def test_virtual_episodes_preview_their_own_wind():
     saved = virtual.state_dict()
     virtual.load_state_dict(saved)
     assert virtual.draw(2).exogenous.shape == (2, plant.n_steps, 4)
+
+
+# What policies of some sensors see, and twins that trainings identify without noise.
+
+
+SENSORS = {
+    "wind_turbine": ("rotor_speed",),
+    "flapping_wing": ("forward_position", "height"),
+    "cryogenic_tank": ("pressure",),
+}
+"""The sensors that are there, beside those of the inputs."""
+SEEN = {"wind_turbine": (), "flapping_wing": ("--observe", "position+wind"), "cryogenic_tank": ()}
+"""Options with which the policies observe nothing but these sensors and what a controller computes from them."""
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_policies_of_some_sensors_see_nothing_else(name):
+    """No change of another state, which no controller holds, changes the observation."""
+    config = from_command_line(load_recipe(RECIPES / f"{name}.py").Config, SEEN[name])
+    plant, generator = config.plant(), torch.Generator().manual_seed(0)
+    state, time = plant.draw_initial_state(1, generator), torch.zeros(1).double()
+    exogenous = plant.draw_exogenous(1, generator)[:, 0]
+    seen = plant.observe(time, state, exogenous)
+    for k, signal in enumerate(plant.states):
+        if signal.name not in (*SENSORS[name], *plant.controller_states):
+            moved = state.clone()
+            moved[:, k] += 0.01
+            assert torch.equal(plant.observe(time, moved, exogenous), seen), signal.name
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("name", "episodes", "words", "most"),
+    [
+        # Without noise the fit goes on until steps end in rounding.
+        ("flapping_wing", 1, ("--twinning.assimilation.iterations", "60"), 1e-3),
+        ("cryogenic_tank", 2, (), 1e-2),
+    ],
+)
+def test_the_weights_are_those_of_the_real_system_after_two_and_three_episodes(tmp_path, name, episodes, words, most):
+    """The classical controller flies the first of them; the twin has the true form, and sensors have no noise."""
+    fitted = ["--twinning.assimilation.inputs", "record", "--twinning.assimilation.method", "levenberg_marquardt"]
+    fitted += ["--twinning.arm", "model_based", "--twinning.hypotheses.which", "none", *words]
+    short = ["--episodes", str(episodes), "--unseen", "2", "--no-figures", "--threads", "1"]
+    recipe = load_recipe(RECIPES / f"{name}.py")
+    recipe.main(from_command_line(recipe.Config, [*short, *fitted, "--log-dir", str(tmp_path)]))
+    laws = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]
+    assert max(abs(laws["found"][weight] / true - 1.0) for weight, true in laws["true"].items()) < most
+
+
+# What a newcomer writes for a plant of their own, and what exploration adds to its policy.
+
+
+PLANT = LinearQuadratic(horizon=2.0)
+
+
+class Turning(LinearQuadratic):
+    name = "turning"
+    states = (
+        Signal(symbol="x", name="position", unit="m"),
+        Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
+    )
+    state_sizes = (2.0, 0.5)
+
+
+def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way():
+    one, other = torch.tensor([[1.0, 3.0]]).double(), torch.tensor([[5.0, -3.0]]).double()
+    turned = 2.0 * math.pi - 6.0
+    expected = 0.5 * ((4.0 / 2.0) ** 2 + (turned / 0.5) ** 2)
+    assert Turning().discrepancy(one, other).tolist() == pytest.approx([expected], rel=1e-12)
+    Turning.states = Turning.states[:1]
+    with pytest.raises(ValueError, match=r"state_sizes=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
+        Turning().discrepancy(one[:, :1], other[:, :1])
+    Turning.discrepancy_scales = (0.0,)
+    with pytest.raises(ValueError, match=r"discrepancy_scales=\(0.0,\) of plant 'turning'"):
+        Turning().discrepancy(one[:, :1], other[:, :1])
+
+
+class Clocked(LinearQuadratic):
+    measurements = (
+        Measurement.of(LinearQuadratic.states[1], offset=1.0, scale=2.0),
+        Measurement.of(LinearQuadratic.inputs[0]),
+        Measurement(symbol="c", name="day", unit="-", read=Phase("cosine", 4.0)),
+        Measurement(symbol="s", name="night", unit="-", read=Phase("sine", 4.0)),
+    )
+
+    def observe(self, t, state, exogenous):
+        return super(LinearQuadratic, self).observe(t, state, exogenous)
+
+
+def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unchecked):
+    plant = Clocked(horizon=2.0)
+    state, exogenous = torch.tensor([[7.0, 5.0]]).double(), torch.tensor([[0.25]]).double()
+    seen = plant.observe(torch.tensor([1.0]).double(), state, exogenous)
+    torch.testing.assert_close(seen, torch.tensor([[2.0, 0.25, 0.0, 1.0]]).double(), rtol=0, atol=1e-15)
+
+
+def test_a_run_refuses_them_before_any_work(tmp_path, unchecked):
+    config = RunConfig(log_dir=tmp_path / "run")
+    with pytest.raises(ValueError, match="first, an instance of LinearGain, must be a class"):
+        Run(config, PLANT, first=LinearGain([[1.0, 1.0]]))
+    with pytest.raises(ValueError, match=r"baselines\['PD'\], an instance of PD, must be .*give its class, PD"):
+        Run(config, PLANT, baselines={"PD": PD(PLANT)})
+    with pytest.raises(ValueError, match="plant=<class .* must be a plant; if this is a class, give an instance"):
+        Run(config, LinearQuadratic)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_text_stands_for_a_path(unchecked):
+    assert RunConfig(log_dir="runs/mine").log_dir == Path("runs/mine")
+
+
+# Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.
+
+
+class Held(torch.nn.Module):
+    """A policy that always asks for the same action."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def forward(self, observation):
+        return self.action
+
+
+def noise(plant, n=400, rows=100, *, strength=1.0, **options):
+    """Actions that noise makes of a policy that asks for mid-range, as shares of half the range."""
+    middle = torch.tensor([0.5 * (a.low + a.high) for a in plant.actions], dtype=torch.float64)
+    config = ExplorationConfig(spread=0.1, **options)
+    actor = LivePolicy(plant, Held(middle.expand(rows, -1)), config, generator=torch.Generator().manual_seed(0))
+    actor.begin(actor.policy, strength=strength)
+    observation = torch.zeros(rows, len(plant.observations), dtype=torch.float64)
+    acted = torch.stack([actor(observation) for _ in range(n)])
+    half = torch.tensor([0.5 * (a.high - a.low) for a in plant.actions], dtype=torch.float64)
+    return (acted - middle) / half
+
+
+@pytest.mark.parametrize("intervals", [0.0, 3.0])
+def test_deviation_and_correlation_are_those_asked_for(intervals):
+    plant = LinearQuadratic()
+    found = noise(plant, correlation_time=intervals * plant.dt, strength=0.5)
+    rho = math.exp(-1.0 / intervals) if intervals else 0.0
+    # Standard error of a deviation over 40 000 samples of which some 1 + 2ρ/(1 − ρ) count as one: 2 % at most.
+    assert found.std((0, 1)).tolist() == pytest.approx([0.05] * len(plant.actions), rel=0.05)
+    for lag in (1, 2, 5):
+        correlation = (found[lag:] * found[:-lag]).mean((0, 1)) / found.square().mean((0, 1))
+        assert correlation.tolist() == pytest.approx([rho**lag] * len(plant.actions), abs=0.04)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from figure_reading import draw
 from linear_quadratic import LinearGain, LinearQuadratic
-from small_runs import SMALL
+from small_runs import FULL, IDLE
 from test_algorithm import flown, twinning
 from test_classical import PD
 from test_real_system import Rig, connected
@@ -46,7 +46,7 @@ class Machine(Rig):
         return told
 
 
-def run_on(machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=SMALL, **options):
+def run_on(machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=FULL, **options):
     own = {"episodes": 2, "unseen": 3, "figures": False}
     config = RunConfig(log_dir=folder, twinning=twinning, **own | options)
     plant = machine.inner.plant
@@ -181,9 +181,8 @@ def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_pat
 
 def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
     """The model-free arm acts; without iterations its weights are still the random ones."""
-    learner = dataclasses.replace(SMALL.learner, critic_iterations=0, actor_iterations=0)
     rig = machine()
-    run = run_on(rig, tmp_path, real_unseen=2, twinning=dataclasses.replace(SMALL, arm="model_free", learner=learner))
+    run = run_on(rig, tmp_path, real_unseen=2, twinning=dataclasses.replace(FULL, arm="model_free", learner=IDLE))
     metrics = run.train()
     live = metrics["summary"]["live"]
     weights = [parameters_to_vector(each[live].parameters()) for each in (run.initial_policies, run.algorithm.policies)]
@@ -191,7 +190,7 @@ def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for
     assert len(rig.flights) == 2 and "real_unseen" not in metrics["summary"]
     assert "random initial weights" in capsys.readouterr().out
     # Controllers that fly where it does not are compared with no policy.
-    options = {"real_unseen": 2, "twinning": dataclasses.replace(SMALL, arm="model_free", learner=learner)}
+    options = {"real_unseen": 2, "twinning": dataclasses.replace(FULL, arm="model_free", learner=IDLE)}
     found = run_on(machine(), tmp_path / "beside", baselines={"PD": PD, "mine": Tracking}, **options).train()["summary"]
     flown = found["real_unseen"]["controllers"]
     assert [*flown] == ["PD", "mine"] and not any("ratio" in one for one in flown.values())

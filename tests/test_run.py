@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_runs import SMALL, believing, small_run, stepped_cost
+from small_runs import FULL, SMALL, believing, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
@@ -102,9 +102,9 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
 
 
 def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
-    whole = small_run(tmp_path / "whole", episodes=4).train()
-    small_run(tmp_path / "parts", episodes=2).train()
-    parts = small_run(tmp_path / "parts", episodes=4, resume=True).train()
+    whole = small_run(tmp_path / "whole", episodes=4, twinning=FULL).train()
+    small_run(tmp_path / "parts", episodes=2, twinning=FULL).train()
+    parts = small_run(tmp_path / "parts", episodes=4, resume=True, twinning=FULL).train()
     assert_same(whole, parts)
 
 
@@ -123,7 +123,7 @@ PARTS = dataclasses.replace(
     hypotheses=HypothesesConfig(),
     assimilation=AssimilationConfig(iterations=3, method="levenberg_marquardt", inputs="record"),
     planner=PlannerConfig(iterations=2),
-    learner=dataclasses.replace(SMALL.learner, algorithm="td3"),
+    learner=dataclasses.replace(FULL.learner, algorithm="td3"),
     referee=RefereeConfig(clone_patience=0),
 )
 """All parts of the method that the paper does not have."""
@@ -215,7 +215,7 @@ def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
         return Collector(env, acting, frames_per_batch=plant.n_steps, total_frames=-1, reset_at_each_iter=True)
 
     def run(folder, **parts):
-        return small_run(tmp_path / folder, parts=parts).train()
+        return small_run(tmp_path / folder, parts=parts, twinning=FULL).train()
 
     parts = {
         "learner": partial(ActorCritic, replay=noted("replay", LongTermMemory)),

@@ -188,12 +188,23 @@ def test_a_run_from_a_log_is_resumed_without_the_log(tmp_path):
         training(tmp_path / "run", episodes=3, resume=True)
 
 
+class Falling(LinearQuadratic):
+    """It falls to the side where it starts: a PD law of small gains does not hold it, and hardly any force does."""
+
+    A = ((0.0, 1.0), (1.0, 0.0))
+
+    def draw_initial_state(self, batch, generator):
+        return 0.2 * super().draw_initial_state(batch, generator).abs()
+
+
 def test_model_predictive_control_flies_first(tmp_path):
-    found = training(tmp_path, start="mpc", seed=5).algorithm
-    report = found.start()
-    controller = training(tmp_path / "controller", start="controller", seed=5).algorithm.start()["start_cost"]
-    assert report["start_cost"] < controller and report["start_error_model_free"] < 0.05
-    assert report["start_cost_ratio_model_free"] < 1.1
+    """Within the actions' ranges, where it is a linear law, which a gain imitates."""
+    plant = Falling(horizon=2.0, noise=0.0)
+    report, controlled = (
+        training(tmp_path / start, plant, start=start).algorithm.start() for start in ("mpc", "controller")
+    )
+    assert report["start_cost"] < 0.9 * controlled["start_cost"] and report["start_error_model_free"] < 0.02
+    assert report["start_cost_ratio_model_free"] < 1.02
 
 
 class Ending(LinearQuadratic):
