@@ -176,7 +176,7 @@ def test_episodes_that_explore_raise_no_alarm(spread, raised):
 
 
 def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
-    """The twin is exact in all but the cost of its own plans, which is ten times as high."""
+    """The twin is exact in all but the cost of its own plans, which is a hundred times as high."""
     plant = LinearQuadratic(horizon=2.0)
     found = twinning(
         plant,
@@ -190,12 +190,12 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
     def flown(policy, *, strength, whole):
         flight = fly(policy, strength=strength, whole=whole)
         dear = (policy.gain - first).abs().max().item() > 0.05
-        flight.transitions["next", "reward"] *= 10.0 if dear else 1.0
+        flight.transitions["next", "reward"] *= 100.0 if dear else 1.0
         flights.append(policy.gain.flatten().tolist() if dear else None)
         return flight
 
     found.flights.fly = flown
-    reports = [found.episode() for _ in range(16)]
+    reports = [found.episode() for _ in range(10)]
     refuted = [weights for weights in flights if weights]
     assert flights[0] is None and flights[1] and all(refuted.count(weights) == 1 for weights in refuted)
     assert reports[1]["alarm"].item() == 1.0 and not any(flights[-5:])
