@@ -34,7 +34,7 @@ def test_every_page_with_code_is_run():
 
 def leave_finished_run(folder):
     """A run of the turbine with random weights and two episodes, as a training leaves it."""
-    leave_run(folder, "wind_turbine", policy="bias", horizon=300.0)
+    leave_run(folder, "wind_turbine", policy="bias", horizon=60.0)
     episodes = [
         {"episode": k, "live": "model_based", "event": "keep", "real_cost": 0.1 - 0.01 * k, "J_p": 2.0, "seconds": {}}
         for k in range(2)

@@ -90,5 +90,5 @@ def test_gradients_are_those_of_torchdiffeq_by_its_engine(tmp_path, monkeypatch)
     few = ("--twinning.planner.method", "single_start", "--twinning.planner.iterations", "1")
     few += ("--twinning.planner.realisations", "1", "--twinning.assimilation.iterations", "1")
     few += ("--twinning.virtual-episodes", "1")
-    trained(tmp_path / "continuous", "--engine", "odeint_adjoint", *few, seconds=6)
+    trained(tmp_path / "continuous", "--engine", "odeint_adjoint", "--episodes", "1", *few, seconds=6)
     assert len(calls) > 8  # one for every control interval
