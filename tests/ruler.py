@@ -101,7 +101,7 @@ class Result(NamedTuple):
     def of(cls, folder: Path) -> "Result":
         metrics = json.loads((folder / "metrics.json").read_text())
         summary, episodes = metrics["summary"], metrics["episodes"]
-        paid, alarms = sum(one["real_cost"] for one in episodes), sum(one["alarm"] > 0.0 for one in episodes)
+        paid, alarms = sum(one["real_cost"] for one in episodes), sum(one.get("alarm", 0.0) > 0.0 for one in episodes)
         costs = {role: summary["unseen"][f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
         seconds = json.loads((folder / "seconds.json").read_text())
         return cls(costs[summary["live"]], min(costs.values()), paid, alarms, seconds)
