@@ -244,14 +244,13 @@ class ReinforcementTwinning(TensorDictSequential):
             if "model_based" in pupils:
                 self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
-        imitation_report = self.steps["switch"].imitation.begin(
-            self.first.teacher, imitating, batch_of(records), on_twin=on_twin
-        )
+        imitation, flown = self.steps["switch"].imitation, batch_of(records)
+        report = imitation.begin(self.first.teacher, imitating, flown, on_twin=on_twin)
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
             self.virtual.processes.clear()
         start_cost = torch.stack([flight.cost for flight in flights]).mean()
-        return merged(merged(episode, imitation_report), metrics(start_cost=start_cost))
+        return merged(merged(episode, report), metrics(start_cost=start_cost))
 
     def _sound(self, step: Callable[[TensorDictBase], TensorDictBase], episode: TensorDictBase) -> TensorDictBase:
         """Take a step that relies on the twin; the one rollback of the algorithm.

@@ -334,8 +334,6 @@ class Assimilate(Step):
         """Fit the twin to records; the report of the fit."""
         latest, processes = self.belief.virtual.paired(records)
         self.closure_before = copy.deepcopy(self.belief.virtual.twin.closure.state_dict())
-        descended = self.assimilation.update(latest, processes, self.realisations, self.generator)
-        fit = metrics(
-            J_p_before=descended.start, J_p=descended.best, closure_gradient=descended.gradient, closure_refused=0.0
-        )
-        return merged(fit, metrics(**self.assimilation.report()))
+        fit = self.assimilation.update(latest, processes, self.realisations, self.generator)
+        report = metrics(J_p_before=fit.start, J_p=fit.best, closure_gradient=fit.gradient, closure_refused=0.0)
+        return merged(report, metrics(**self.assimilation.report()))

@@ -231,11 +231,8 @@ class Belief:
         differences = self.differences()
         if not differences or math.isnan(differences[-1]) or not self._policy_flew:
             return metrics()
-        quiet = [
-            d
-            for d, flown in zip(differences, self.flown, strict=True)
-            if flown.exploration <= QUIET and not math.isnan(d)
-        ]
+        pairs = zip(differences, self.flown, strict=True)
+        quiet = [d for d, flown in pairs if flown.exploration <= QUIET and not math.isnan(d)]
         warning, hypothesis = alarm(quiet), self.virtual.twin.hypothesis
         report = metrics(paired_difference=differences[-1], alarm=float(warning is not None))
         if warning is None:
@@ -247,11 +244,9 @@ class Belief:
     def unexplained(self) -> float:
         """Size of the last paired difference beyond what exploration explains."""
         differences = self.differences()
-        return (
-            0.0
-            if not differences or math.isnan(differences[-1])
-            else beyond(differences[-1], self.flown[-1].exploration)
-        )
+        if not differences or math.isnan(differences[-1]):
+            return 0.0
+        return beyond(differences[-1], self.flown[-1].exploration)
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory]) -> float:

@@ -380,11 +380,9 @@ class MultiStart:
         self._first, self._stalled = state["first"], state["stalled"]
 
 
-def planned(descent: Descended) -> TensorDict:
+def planned(plan: Descended) -> TensorDict:
     """The report of a plan that is kept."""
-    return metrics(
-        J_a_plan_before=descent.start, J_a_plan=descent.best, policy_gradient=descent.gradient, plan_accepted=1.0
-    )
+    return metrics(J_a_plan_before=plan.start, J_a_plan=plan.best, policy_gradient=plan.gradient, plan_accepted=1.0)
 
 
 class MakePlan(Step):

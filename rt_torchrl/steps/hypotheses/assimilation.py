@@ -101,11 +101,9 @@ class Reread(Extension):
     ) -> Transition:
         """One interval of the plant from the readings, or from its own states."""
         inputs, readings, flag = exogenous.split([self._met, self._read, 1], -1)
-        simulated, hidden = state[..., : self._read], state[..., self._read :]
-        measured = torch.where(
-            flag + torch.zeros_like(simulated) > 0.5, readings + torch.zeros_like(simulated), simulated
-        )
-        return self.base.step(t, torch.cat([measured, hidden], -1), command, inputs, closure)
+        states, hidden = state[..., : self._read], state[..., self._read :]
+        start = torch.where(flag + torch.zeros_like(states) > 0.5, readings + torch.zeros_like(states), states)
+        return self.base.step(t, torch.cat([start, hidden], -1), command, inputs, closure)
 
 
 def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
