@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl import (
     Actuation,
     ClassicalController,
+    DigitalTwin,
     Measurement,
     Plant,
     PlantEnv,
@@ -24,6 +25,7 @@ from rt_torchrl import (
     SafetyConfig,
     SafetyLayer,
     Signal,
+    Trajectory,
     WiringError,
     check_real_system,
 )
@@ -37,6 +39,7 @@ from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.systems.environment import AroundSystem
+from rt_torchrl.systems.preflight import check_record
 
 
 class Outlets(PositiveCoefficients):
@@ -287,6 +290,18 @@ def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_an
     assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
     with pytest.warns(UserWarning, match=f"the twin leaves {100.0 * share:.3g} % of level_1, .* unexplained: noise of"):
         check.require()
+
+
+def test_a_record_without_the_first_intervals_of_a_flight_is_checked():
+    """The safety layer has refused the first readings."""
+    plant, generator = LEVELS, torch.Generator().manual_seed(0)
+    actions = 10.0 * torch.rand(1, plant.n_steps, 2, generator=generator, dtype=torch.float64)
+    start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    states = DigitalTwin(plant, plant.closure).replay(start, inputs, actions).states[0]
+    noisy = states + 0.05 * torch.randn(states.shape, generator=generator, dtype=torch.float64)
+    record = Trajectory(noisy[10:], actions[0, 10:], inputs[0, 10:], 10 * plant.dt)
+    check = check_record(record, plant, plant.make_closure())
+    assert not check.mistakes and "unexplained: noise of a sensor" in str(check)
 
 
 def test_a_start_far_from_what_the_plant_draws_is_a_warning():

@@ -303,8 +303,10 @@ def _at_first(fit: "_Fit", flown: Flown) -> list[Suspicion]:
     """
     rows = flown.t < (EARLY - 0.5) * fit.plant.dt
     early = Flown._make([*(column[rows] for column in flown[:7]), flown.ratio, flown.signs])
+    if early.ends.numel() <= len(fit.guess):
+        return []
     present = fit.suspicion("", early)
-    if early.ends.numel() <= len(fit.guess) or not (present.unexplained > EXPLAINED).any():
+    if not (present.unexplained > EXPLAINED).any():
         return []
     return [mistake for mistake in _better(present, fit, early) if not (mistake.unexplained > EXPLAINED).any()]
 
