@@ -274,10 +274,11 @@ def _moving_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
     drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
     constant, size = (drawn == drawn[:, :1]).all(1).all(0), drawn.abs().amax((0, 1))
     moves = (flown.exogenous - flown.earlier_exogenous).abs().amax(0) > RESOLUTION * size
-    if names := [signal.name for signal, odd in zip(plant.inputs, constant & moves, strict=True) if odd]:
+    odd = constant & moves & (size > 0.0)  # an input that is always zero has no size
+    if names := [signal.name for signal, strange in zip(plant.inputs, odd, strict=True) if strange]:
         yield (
             f"the readings of input {', '.join(names)} move within an episode, where the plant draws constant ones: "
-            "read relative to something that moves, or other courses than those that plans are made for"
+            "noise of a sensor, what is read relative to something that moves, or other courses than those of plans"
         )
 
 
@@ -331,7 +332,7 @@ def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
     kinds: dict[str, Suspicion] = {}
     for mistake in tried:
         if mistake.score < min(present.score, tried[0].score + 2.0 * MARGIN) - MARGIN:
-            kinds.setdefault(re.split(",| in ", mistake.mistake)[0], mistake)
+            kinds.setdefault(re.split(",| (?:is|are) in ", mistake.mistake)[0], mistake)
     return list(kinds.values())
 
 
