@@ -138,19 +138,20 @@ class Belief:
         Raises:
             ValueError: if the cost is negative, because differences are logs of the ratio of two costs.
         """
-        if cost < 0.0 and self.corrects:
-            raise self._negative(cost)
+        self._require_ratio(cost)
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
         self._costs, self._anchored, self._policy_flew = None, None, True
 
-    def _negative(self, cost: float) -> ValueError:
-        return ValueError(
-            f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training with "
-            "a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a constant that "
-            "keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
-        )
+    def _require_ratio(self, cost: float) -> None:
+        """Refuse a negative cost, because a paired difference is the log of the ratio of two costs."""
+        if cost < 0.0 and self.corrects:
+            raise ValueError(
+                f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training "
+                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
+                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
+            )
 
     def append_first(self, trajectory: Trajectory, cost: float) -> None:
         """Add an episode that the controller has flown with which the training has begun.
@@ -158,8 +159,7 @@ class Belief:
         Raises:
             ValueError: if the cost is negative.
         """
-        if cost < 0.0 and self.corrects:
-            raise self._negative(cost)
+        self._require_ratio(cost)
         self.first = [*self.first, FirstFlown(trajectory, cost)][-ANCHORS:]
         self._policy_flew = False
 

@@ -225,11 +225,10 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
     mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
     if not mistakes and not explained:
         mistakes = _at_first(fit, flown) or _better(present, fit, flown)
-    doubts = (*_doubts(plant, present), *_strange_starts(plant, flown), *_moving_inputs(plant, flown))
-    return Wiring(plant, present, moved, tuple(mistakes), () if mistakes else doubts)
+    return Wiring(plant, present, moved, tuple(mistakes), () if mistakes else tuple(_doubts(plant, present, flown)))
 
 
-def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
+def _doubts(plant: Plant, present: Suspicion, flown: Flown) -> Iterator[str]:
     """What no mistake explains and may be right all the same."""
     shares = zip(plant.states, present.unexplained.tolist(), strict=True)
     if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
@@ -237,6 +236,8 @@ def _doubts(plant: Plant, present: Suspicion) -> Iterator[str]:
             f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, such as "
             "a stop, or a mistake in a Reading, an Actuation or the plant's equations"
         )
+    yield from _strange_starts(plant, flown)
+    yield from _moving_inputs(plant, flown)
 
 
 def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:

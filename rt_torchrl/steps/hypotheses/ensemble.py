@@ -140,9 +140,8 @@ class TwinEnsemble(DigitalTwin):
         both can be compared.
         """
         twins = [self.twins[name] for name in self._shares]
-        starts = {twin: twin.plant.at_rest(initial_state) for twin in twins}
-        costs = torch.stack([twin.episode_costs(policy, start, exogenous) for twin, start in starts.items()])
-        return costs.new_tensor(list(self._shares.values())) @ costs
+        costs = [twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins]
+        return initial_state.new_tensor(list(self._shares.values())) @ torch.stack(costs)
 
 
 def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, engine: Engine = "native") -> DigitalTwin:
