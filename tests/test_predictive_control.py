@@ -65,6 +65,18 @@ def test_it_acts_on_the_real_system_as_it_flies_in_simulation(forecast):
     assert 0.0 < found["solve_median"] <= found["solve_max"]
 
 
+def test_a_controller_that_takes_over_within_a_period_begins_with_its_plan():
+    """Nothing of this plant depends on the time."""
+    state, inputs = torch.tensor([[1.0, -0.5]]).double(), torch.zeros(1, 1).double()
+    controller = RecedingHorizon(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0, period=0.5))
+    commands = controller.plan(0.0, state, inputs)
+    controller.begin()
+    late = [controller.act(k * PLANT.dt, state, inputs) for k in (3, 4)]
+    assert torch.equal(torch.stack(late, 1), commands[:, :2]) and not torch.equal(late[0], late[1])
+    assert len(controller.solves) == 2
+    assert torch.equal(controller.act(5 * PLANT.dt, state, inputs), controller._commands[:, 0])
+
+
 class Undisturbed(LinearQuadratic):
     """The plant of the oracle without inputs."""
 

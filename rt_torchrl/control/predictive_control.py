@@ -119,6 +119,8 @@ class RecedingHorizon:
         """Begin new episodes."""
         self._plans: list[Plan] = []
         self._commands: Tensor | None = None
+        self._planned = 0
+        """Interval of the period in which the plan was made; one that takes over plans at once."""
 
     def plan(self, t: float, state: State, exogenous: Input) -> Actions:
         """Plan anew and return the commands of the whole window.
@@ -173,8 +175,8 @@ class RecedingHorizon:
         """The command of the control interval at t [s], which follow each other; every period it plans."""
         k = round(t / self.plant.dt) % self.period
         if k == 0 or self._commands is None:
-            self._commands = self.plan(t, state, exogenous)
-        return self._commands[:, k]
+            self._commands, self._planned = self.plan(t, state, exogenous), k
+        return self._commands[:, k - self._planned]
 
     @torch.no_grad()
     def fly(
