@@ -167,7 +167,8 @@ class UnseenEpisodes:
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
-        The twin begins with what sensors read, and is compared with it. J_p is infinite where the twin diverges.
+        The twin begins with what sensors read, and is compared with it, to an early end where an episode has one. J_p
+        is infinite where the twin diverges.
 
         Args:
             physics: physics of the twin, which need not be that of the real system.
@@ -177,9 +178,6 @@ class UnseenEpisodes:
                 episodes.
         """
         rollout = Rollout(physics, closure)
-        episodes = len(flown.states)
-        flown = flown.segments(segment, physics.dt) if segment else flown
-        measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
 
         def costs(batch: Trajectory) -> Costs:
             try:
@@ -191,7 +189,18 @@ class UnseenEpisodes:
                 return torch.cat([costs(batch.rows(row)) for row in rows])
             return identification_cost(physics, replayed, batch.states)
 
-        return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
+        def means(flown: Trajectory) -> Costs:
+            episodes, n = flown.actions.shape[:2]
+            flown = flown.segments(min(segment, n), physics.dt) if segment else flown
+            measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
+            return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
+
+        over = self.plant.ended(flown.states[:, 1:])
+        if not over.any():
+            return means(flown)
+        lengths = torch.where(over.any(1), over.int().argmax(1) + 1, over.shape[1]).tolist()
+        parts = [episode.part(0, n, physics.dt) for episode, n in zip(flown.each(), lengths, strict=True)]
+        return torch.cat([means(batch_of([part])) for part in parts])
 
 
 class TwinEpisodes(UnseenEpisodes):
@@ -283,11 +292,9 @@ class RealEpisodes(UnseenEpisodes):
         )
 
     def _actor(self, policy: nn.Module) -> "TensorDictModule":
-        """The policy at the beginning of an episode."""
+        """The policy at the beginning of an episode, within the ranges of the actions."""
         from tensordict.nn import TensorDictModule
 
-        if not isinstance(policy, StateFeedback):
-            return TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
         device = self.initial_state.device
         live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))
         live.begin(policy, strength=0.0)
