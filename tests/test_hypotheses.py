@@ -285,6 +285,10 @@ def test_the_state_is_kept():
         one.update([record], (), 1, torch.Generator())
     assert other.weights == twin.weights == {"lags": 1.0} and resumed.misfits == assimilation.misfits
     assert counters(resumed) == counters(assimilation) and counters(resumed)["late"][1:] == (0, 2)
+    for share in range(1, 100):  # of several weights too, to the bit
+        twin.weights = {"lags": 1.0, "late": share / 100.0}
+        resumed.load_state_dict(assimilation.state_dict())
+        assert other.weights == twin.weights
     for name, one in twin.twins.items():
         for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
             assert torch.equal(mine, its)

@@ -1,6 +1,7 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
 import copy
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -70,6 +71,7 @@ class TwinEnsemble(DigitalTwin):
     @weights.setter
     def weights(self, shares: Mapping[str, float]) -> None:
         total = sum(shares.values())
+        total = 1.0 if math.isclose(total, 1.0) else total  # shares that were saved stay the same to the bit
         self._shares = {name: share / total for name, share in shares.items()}
 
     @property
