@@ -7,10 +7,13 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import FULL, SMALL
+from test_algorithm import flown
 from test_export_recipe import RECIPES, recipe
 
 from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.steps.config import ROLES
+from rt_torchrl.steps.imitation import Imitation
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
@@ -73,8 +76,8 @@ def test_an_interrupted_training_goes_on_to_the_bit(tmp_path):
         assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
 
 
-def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
-    run = training(tmp_path, 1)
+def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path, monkeypatch):
+    run, of_record = training(tmp_path, 1), Imitation._of_record
     algorithm = run.algorithm
     algorithm.referee.live = "model_based"
     algorithm.episode()
@@ -84,6 +87,16 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     given = {"seen": algorithm.learner.observations, "record": algorithm.short_term[-1], "judged_on": judged}
     found = clone(policies["model_based"], policies["model_free"], **given)
     assert 0.0 < found["distillation_error"] < 0.3
+    # What the other policy did in the real episode is nothing that the controller does.
+    records, others = [], ("learn", "inputs", "assimilate", "plan")
+    monkeypatch.setattr(algorithm.referee, "decide", lambda evidence: "clone")
+    monkeypatch.setattr(Imitation, "_of_record", lambda self, record: records.append(record) or of_record(self, record))
+    for flew in ROLES:
+        algorithm.referee.live = flew
+        episode = flown(algorithm, "interact", *others)
+        algorithm.referee.live = "model_based"
+        flown(algorithm, "switch", episode=episode)
+    assert [len(record.actions) for record in records if record.actions.ndim == 2] == [20, 0]
     refused = clone(policies["model_free"], policies["model_based"], **given)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()

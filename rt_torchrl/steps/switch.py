@@ -137,8 +137,8 @@ MakeReferee = Callable[[RefereeConfig, Role], Referee]
 class Switch(Step):
     """Step 6: the referee decides by what both policies cost over the same N virtual episodes.
 
-    Reads ``record`` and the relative ``weight_changes`` of both policies. Writes ``event``, ``J_a_model_based`` and
-    ``J_a_model_free`` on the twin.
+    Reads ``live``, ``record`` and the relative ``weight_changes`` of both policies. Writes ``event``,
+    ``J_a_model_based`` and ``J_a_model_free`` on the twin.
 
     Args:
         referee: the referee.
@@ -150,7 +150,7 @@ class Switch(Step):
         count: number N of virtual episodes.
     """
 
-    in_keys = ["record", ("weight_changes", "model_free"), ("weight_changes", "model_based")]
+    in_keys = ["live", "record", ("weight_changes", "model_free"), ("weight_changes", "model_based")]
     out_keys = ["event", "J_a_model_based", "J_a_model_free"]
 
     def __init__(
@@ -191,6 +191,8 @@ class Switch(Step):
         report = report.update(metrics(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
         if event == "clone":
             policies, record = (self.policies[live], self.policies[idle]), record_of(episode)
+            if episode["live"] != live:  # another one flew, whose actions say nothing of this one
+                record = record.part(0, 0, 0.0)
             cloned = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)
             if "reason" not in cloned:
                 self.halves[idle].restart()
