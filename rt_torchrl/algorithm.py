@@ -7,9 +7,9 @@ the steps:
 | key | shape, unit | written by | read by |
 |---|---|---|---|
 | ``number`` | number of the episode, from 0 | the algorithm | 1, 5 |
-| ``live`` | role of the policy that acts | the algorithm, 1 | 1 |
+| ``live`` | role of the policy that acts | the algorithm, 1 | 1, 6 |
 | ``record/states``, ``actions``, ``exogenous``, ``start`` | n+1 × n_s, n × n_a, n × n_z, [s] | 1 | 3, 4, 6 |
-| ``record/whole``, ``record/ended`` | whether it is that of a whole episode, and whether this ended early | 1 | 3 |
+| ``record/whole`` | whether it is that of a whole episode, to its horizon or to its early end | 1 | 3, 4 |
 | ``transitions/k`` | n_k transitions of each sound part | 1 | 2 |
 | ``real_cost`` | J_a as measured | 1 | |
 | ``weight_changes/model_free``, ``/model_based`` | relative change ‖Δw‖/‖w‖ | 2, 5 | 6 |
@@ -210,6 +210,7 @@ class ReinforcementTwinning(TensorDictSequential):
         steps: dict[str, Callable[[TensorDictBase], TensorDictBase]] = dict(self.module.items())
         if self.first is not None and not self.episodes_done:
             steps = {"start": self.start} | steps
+        self.flights.faults = []
         for name, step in steps.items():
             safe_point()
             tell(name)
@@ -228,7 +229,6 @@ class ReinforcementTwinning(TensorDictSequential):
             half.restart()
         if not pupils:
             return episode
-        self.flights.faults = []
         flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         for flight in flights:
@@ -248,7 +248,8 @@ class ReinforcementTwinning(TensorDictSequential):
         report = imitation.begin(self.first.teacher, imitating, flown, on_twin=on_twin)
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
-            self.virtual.processes.clear()
+            if not flights[-1].ended:
+                self.virtual.processes.clear()
         start_cost = torch.stack([flight.cost for flight in flights]).mean()
         return merged(merged(episode, report), metrics(start_cost=start_cost))
 

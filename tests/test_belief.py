@@ -241,6 +241,8 @@ def test_an_update_that_flights_refute_is_taken_back(corrects, kept):
     belief, learner = belief_of(*REFUTED, corrects=corrects), Hasty(LinearGain([[3.0, 0.0]]))
     learned = Learn(learner, belief, 1)(TensorDict({"transitions": {}}))
     assert said(learner.policy) == kept and ("update_accepted" in learned) == corrects
+    expected = "update refused: model_free is expected to cost 14.8 with it, and 3.004 without"  # and 2 on the twin
+    assert not corrects or learned["reason"] == expected
     assert learned["weight_changes", "model_free"] == pytest.approx(0.0 if corrects else 0.5)
 
 

@@ -8,17 +8,23 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from seeds_and_numbers import drawn
 from small_runs import SMALL
+from test_classical import PD
 from test_learn import values
 from test_real_system import Rig, connected
 
 from rt_torchrl import (
     DigitalTwin,
+    FirstController,
+    OperatingLimits,
     PlannerConfig,
     PlantEnv,
     ReinforcementTwinning,
+    SafetyConfig,
+    SafetyLayer,
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimisers.descent import DescentConfig
@@ -26,11 +32,13 @@ from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig
+from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
+from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, continued, control_cost, identification_cost
 
 
 class Falling(LinearQuadratic):
@@ -263,3 +271,53 @@ def test_the_plant_of_the_documentation_breaks_its_rod():
 def test_inputs_are_continued_without_a_jump():
     record = torch.arange(3.0).double().unsqueeze(-1)
     assert continued(record, 8).flatten().tolist() == [0, 1, 2, 2, 1, 0, 0, 1]
+
+
+def test_a_twin_is_compared_with_an_episode_to_its_end():
+    """After the end the real system stands still, and what is replayed runs on."""
+    plant, wrong = Falling(), LinearClosure([[0.0, 0.0], [0.3, 0.1]])
+    unseen = UnseenEpisodes(plant, 4)
+    flown = unseen.fly(LinearGain(WEAK))
+    for segment in (0, 10, 40):
+        assert unseen.identification_costs(plant, plant.closure, flown, segment).max() < 1e-20
+    expected = []
+    for episode in flown.each():
+        n = int(plant.ended(episode.states).int().argmax())
+        flight = batch_of([episode.part(0, n, plant.dt)])
+        replayed = Rollout(plant, wrong)(flight.states[:, 0], flight.exogenous, flight.actions)
+        expected.append(identification_cost(plant, replayed, flight.states))
+    torch.testing.assert_close(unseen.identification_costs(plant, wrong, flown), torch.cat(expected))
+
+
+def begun():
+    """The algorithm after a flight of a controller under which the rod falls."""
+    plant, generator = Falling(noise=0.01), torch.Generator().manual_seed(0)
+    limits = OperatingLimitsConfig(states={"velocity": (-0.5, 0.5)})
+    safety = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
+    policies = {role: LinearGain(WEAK) for role in ("model_free", "model_based")}
+    return ReinforcementTwinning(
+        SafetyLayer(PlantEnv(plant, seed=1), safety, fallback=(0.0,)),
+        DigitalTwin(plant, plant.make_closure(generator)),
+        **policies,
+        config=dataclasses.replace(SMALL, limits=limits),
+        generator=generator,
+        first=FirstController(PD(plant, (1.0, 0.1))),
+    )
+
+
+def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch):
+    """Virtual episodes are whole, nobody imitates after an end, and no policy acts that would leave the limits."""
+    found, imitated, match = begun(), [], Imitation._match
+
+    def matched(self, pupil, pairs):
+        imitated.extend(observations for observations, _ in pairs)
+        return match(self, pupil, pairs)
+
+    monkeypatch.setattr(Imitation, "_match", matched)
+    found.start()
+    plant = found.twin.plant
+    assert len(found.belief.first[0].trajectory.actions) < plant.n_steps
+    assert found.virtual.draw(2).exogenous.shape[1] == plant.n_steps
+    assert imitated and not any(plant.ended(observations).any() for observations in imitated)
+    choice = found.steps["interact"].supervisor.choose("model_based", 5)
+    assert choice.role == "first" and "would leave the limits" in choice.report["reason"]

@@ -9,8 +9,9 @@ from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from small_runs import SMALL
 from test_algorithm import twinning
+from test_classical import PD
 
-from rt_torchrl import DigitalTwin, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
+from rt_torchrl import DigitalTwin, FirstController, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -103,10 +104,22 @@ def test_an_episode_that_ends_early_is_kept_up_to_there(kind, records):
         report = found.episode()
         kept += kind == "ends_early"  # what the system reports with its end counts
         assert report["sound_intervals"] == kept and len(found.short_term[-1].actions) == kept
+        assert "paired_difference" not in report  # which would be that of the last whole episode
         assert [fault.kind for fault in found.flights.faults] == ["ended"]
         assert found.flights.faults[0].time == pytest.approx(kept * DT)
         assert report["J_p"].isfinite() and report["J_a_model_based"].isfinite()
-    assert "sound_intervals" not in found.episode() and len(found.belief.flown) == 2
+    report = found.episode()
+    assert "sound_intervals" not in report and "paired_difference" in report and len(found.belief.flown) == 2
+
+
+def test_faults_of_the_flight_that_a_training_begins_with_are_in_its_first_episode():
+    plant = LinearQuadratic(horizon=DT * N)
+    env = guarded(Injection("late", 8, episode=0, value=0.6), Injection("raises", 30, episode=1))
+    found = algorithm(env, first=FirstController(PD(plant)))
+    found.episode()
+    assert [fault.kind for fault in found.flights.faults] == ["late", "ended"]
+    found.episode()
+    assert not found.flights.faults
 
 
 def test_too_little_of_an_episode_is_flown_again():

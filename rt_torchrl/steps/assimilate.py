@@ -325,10 +325,11 @@ class Assimilate(Step):
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         report = self.fit(list(self.short_term))
-        examination = self.belief.examine()
         if self.assimilation.explain(self.belief.unexplained, self.generator):
-            examination = merged(metrics(**self.assimilation.report()), self.belief.examine())
-        return merged(merged(episode, report), examination)
+            report.update(metrics(**self.assimilation.report()))
+        if episode["record", "whole"]:  # a part costs other than the episodes that the twin flies
+            report = merged(report, self.belief.examine())
+        return merged(episode, report)
 
     def fit(self, records: Sequence[Trajectory]) -> TensorDictBase:
         """Fit the twin to records; the report of the fit."""

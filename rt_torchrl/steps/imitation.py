@@ -67,7 +67,8 @@ class Imitation:
             live: the policy that is cloned; it is not changed.
             idle: the policy that becomes the clone.
             seen: function that gives observations of the real system; a copy of weights does not call it.
-            record: the real episode that ``live`` has just flown, from which a clone of state feedback learns.
+            record: the real episode that ``live`` has just flown, from which a clone of state feedback learns; without
+                intervals if another policy flew.
             judged_on: virtual episodes on which the clone is judged.
 
         Returns:
@@ -89,8 +90,8 @@ class Imitation:
         if clone <= replaced:
             return metrics(**entries)
         idle.load_state_dict(before)
-        reason = f"clone refused: its J_a is {clone.on_twin:.4g}, that of the policy it replaces {replaced.on_twin:.4g}"
-        return metrics(reason, **entries).set_non_tensor("event", "keep")
+        costs = f"it is expected to cost {clone.expected:.4g}, and what it replaces {replaced.expected:.4g}"
+        return metrics(f"clone refused: {costs}", **entries).set_non_tensor("event", "keep")
 
     def begin(
         self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, *, on_twin: bool
@@ -143,7 +144,7 @@ class Imitation:
             return metrics(**entries)
         policy.load_state_dict(before)
         return metrics(
-            f"{role} does not imitate the controller: its J_a would be {cost[1]:.4g}, not {start[1]:.4g}", **entries
+            f"{role} does not imitate the controller: it would cost {cost[0]:.4g}, not {start[0]:.4g}", **entries
         )
 
     def imitate(
@@ -189,6 +190,7 @@ class Imitation:
         """Observations of virtual episodes that a policy flies, and what the teacher does there, where both are sound.
 
         A twin that lacks dynamics of the real system may blow up in a flight, and says nothing of what comes after.
+        Nothing acts after an early end.
         """
         plant, like = self.virtual.twin.plant, episodes.initial_state
         try:
@@ -201,6 +203,7 @@ class Imitation:
         except DivergenceError:
             return like.new_empty(0, len(plant.observations)), like.new_empty(0, len(plant.actions))
         sound = (observations.abs() <= BLOWN_UP).all(-1) & actions.isfinite().all(-1)
+        sound &= ~self._thinned(plant.ended(flown.states[:, :-1]).flatten())
         return observations[sound], actions[sound]
 
     @torch.no_grad()
@@ -220,7 +223,7 @@ class Imitation:
         seen = plant.observe(t, flown.states[..., :-1, :], exogenous)
         return seen.reshape(-1, seen.shape[-1])
 
-    def _thinned(self, values: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
+    def _thinned(self, values: Tensor) -> Tensor:
         return values[:: max(1, -(-len(values) // SAMPLES))]  # of none, none is left
 
 

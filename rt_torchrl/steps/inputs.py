@@ -283,8 +283,11 @@ class VirtualEpisodes:
         self.extremes = extreme_states(twin.plant, extremes, generator.device)
 
     def learn(self, record: Trajectory) -> None:
-        """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state."""
-        self.processes.append(self._process(record))
+        """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state.
+
+        Those of an episode that ended early are continued to the horizon.
+        """
+        self.processes.append(self._process(record._replace(exogenous=self.repeated(record).exogenous[0])))
         self.recorded = record.states[0]
 
     def repeated(self, record: Trajectory) -> Scenario:
@@ -386,8 +389,7 @@ class VirtualEpisodes:
 class FitInputs(Step):
     """Step 3: fit a Gaussian process to the exogenous input of the episode, if its record is whole.
 
-    Reads ``record``; inputs of one that ended early are continued to the horizon. Writes ``large_scale``, the large
-    scale d̃ of the inputs that act, n × n_z, of the last process.
+    Reads ``record``. Writes ``large_scale``, the large scale d̃ of the inputs that act, n × n_z, of the last process.
 
     Args:
         virtual: virtual episodes, which keep the processes.
@@ -401,9 +403,6 @@ class FitInputs(Step):
         self.virtual = virtual
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        record, n = record_of(episode), self.virtual.twin.plant.n_steps
-        if episode["record", "ended"]:
-            record = record._replace(exogenous=continued(record.exogenous, n))
         if episode["record", "whole"]:
-            self.virtual.learn(record)
+            self.virtual.learn(record_of(episode))
         return episode.set("large_scale", self.virtual.processes[-1].mean)

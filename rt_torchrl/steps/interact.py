@@ -3,7 +3,6 @@
 import copy
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -107,7 +106,6 @@ def flown(flights: Sequence[Flight]) -> TensorDict:
     """The record of the last of some flights, and the transitions of all their sound parts."""
     last = flights[-1]
     record = last.record
-    flag = partial(torch.tensor, device=record.states.device)
     parts = [part for flight in flights for part in flight.parts]
     return TensorDict(
         {
@@ -116,8 +114,7 @@ def flown(flights: Sequence[Flight]) -> TensorDict:
                 "actions": record.actions,
                 "exogenous": record.exogenous,
                 "start": torch.as_tensor(record.start, dtype=torch.float64, device=record.states.device),
-                "whole": flag(last.whole),
-                "ended": flag(last.ended),
+                "whole": torch.tensor(last.whole, device=record.states.device),
             },
             "transitions": {str(number): part for number, part in enumerate(parts)},
         }
@@ -410,8 +407,8 @@ class Interact(Step):
     """Step 1: the live policy flies one episode on the real system, or acts in a window of one that operates on.
 
     Reads ``number``, that of the episode from 0, and ``live``, the role that acts. Writes ``record``, the trajectory of
-    the sound part (``states`` n+1 × n_s, ``actions`` n × n_a, ``exogenous`` n × n_z, ``start`` [s]; whether it is that
-    of a ``whole`` episode, and whether this ``ended`` early), ``transitions`` of all sound parts, by number, as
+    the sound part (``states`` n+1 × n_s, ``actions`` n × n_a, ``exogenous`` n × n_z, ``start`` [s], and whether it is
+    that of a ``whole`` episode, to its horizon or to its early end), ``transitions`` of all sound parts, by number, as
     TorchRL's collectors give them, and ``real_cost``, J_a as measured.
 
     Args:
@@ -450,7 +447,6 @@ class Interact(Step):
         return self.config.arm != "model_free" and not self.virtual.processes
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        self.flights.faults = []
         live, number = episode["live"], int(episode["number"])
         flights, report = (self.operating or self).take(live, number)
         return merged(episode.update(flown(flights)), report)

@@ -796,8 +796,9 @@ class Learn(Step):
             judgement_before = self.belief.judge(policy, judged_on)
             if judgement > judgement_before:
                 self.learner.restart()
-                costs = f"J_a of model_free would be {judgement.on_twin:.4g}, it was {judgement_before.on_twin:.4g}"
-                report = merged(report, metrics(f"update refused: {costs}", update_accepted=0.0))
+                costs = f"to cost {judgement.expected:.4g} with it, and {judgement_before.expected:.4g} without"
+                refused = f"update refused: model_free is expected {costs}"
+                report = merged(report, metrics(refused, update_accepted=0.0))
             else:
                 policy.load_state_dict(after)
                 report = merged(report, metrics(update_accepted=1.0))
