@@ -11,6 +11,7 @@ from rt_torchrl import PlantEnv, Rollout, control_cost
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.flapping_wing.plant import TrackingCost
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
+from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
@@ -44,6 +45,19 @@ def test_the_engineering_cost_term_by_term():
     assert turbine_cost(RATED, full, 6.0, still, pitch_rate=1.0) == pytest.approx(4.0, rel=1e-12)
     less = turbine_cost(RATED, full - 15e3, 5.0, still)
     assert turbine_cost(RATED, full - 15e3, 5.0, still, torque_rate=1.0) - less == pytest.approx(4.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pitch", "pitch_rate_1", "pitch_play", "pitch_sticks"])
+def test_what_the_rates_of_the_actions_cost_is_that_of_what_a_drive_is_asked_for(name):
+    """A pitch that rises by 0.25 deg in each interval costs 0.25 (deg/s)², wherever the blades are."""
+    rated, free = (
+        unknown(WindTurbine(horizon=5.0, cost=EngineeringCost(pitch_rate=weight)), (name,)) for weight in (1.0, 0.0)
+    )
+    state, wind = rated.draw_initial_state(1, seeded()), rated.draw_exogenous(1, seeded())
+    pitch = 0.25 * torch.arange(1, 11, dtype=torch.float64)
+    flown = Rollout(rated, rated.closure)(state, wind, torch.stack([torch.full_like(pitch, 3e4), pitch], -1)[None])
+    charged = control_cost(rated, flown) - control_cost(free, flown)
+    assert charged.item() == pytest.approx(0.25, rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", [PaperCost, EngineeringCost, TrackingCost, PressureCost])

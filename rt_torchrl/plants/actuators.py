@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -20,7 +21,7 @@ class Actuator(Extension):
     """A plant with an actuator between an action that is asked for and the one that acts on the plant.
 
     A subclass says by :meth:`respond` what the actuator does. By default the first hidden state acts at the start of an
-    interval, and all hidden states begin an episode at rest.
+    interval, and all hidden states begin an episode at rest. A cost of the action's rate is one of what is asked for.
 
     Args:
         base: the plant.
@@ -35,18 +36,29 @@ class Actuator(Extension):
     def __init__(self, base: Plant, action: str, hidden: Sequence[Signal] = (), parameters: nn.Module | None = None):
         self.place = place_of("action", action, base.actions, base.name)
         super().__init__(base, hidden, parameters)
+        names = [state.name for state in base.states]
+        self._last = names.index(action) if action in names else None  # the state that holds the action applied last
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., 0])
 
     def rest(self, base: State) -> Hidden:
         """The state of the action's name, or else the place in the action's range nearest to zero."""
-        signal, names = self.actions[self.place], [state.name for state in self.base.states]
-        if signal.name in names:
-            position = base[..., names.index(signal.name)]
-        else:
+        if self._last is None:
+            signal = self.actions[self.place]
             position = torch.full_like(base[..., 0], min(max(0.0, signal.low), signal.high))
+        else:
+            position = base[..., self._last]
         return position.unsqueeze(-1).expand(*base.shape[:-1], len(self.states) - len(self.base.states))
+
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
+        if part == "task" and arguments.keys() >= {"state", "applied"} and self._last is not None:
+            state, applied = arguments["state"], arguments["applied"]
+            change = self.acting(self.split(state)[1], applied) - applied
+            # The last action moves by as much as the applied one, so that their difference stays.
+            moved = state[..., self._last] + change[..., self.place]
+            arguments["state"] = replaced(state, self._last, moved)
+        return super().ask(part, method, arguments)
 
 
 def _signal_of(base: Plant, action: str) -> Signal:
@@ -185,7 +197,7 @@ class DelayedActuator(Actuator):
                 "approximate a longer one by LaggedActuator with several stages."
             )
         hidden = [
-            Signal(symbol=f"{signal.symbol}_{{-{k}}}", name=f"{action}_{k}_ago", unit=signal.unit)
+            Signal(symbol=f"{signal.symbol}_{{-{k}}}", name=f"delayed_{action}_{k}", unit=signal.unit)
             for k in range(n, 0, -1)
         ]
         super().__init__(base, action, hidden)
