@@ -29,6 +29,8 @@ from rt_torchrl import (
     shipped_plants,
 )
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rosco import Answer
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
@@ -217,9 +219,9 @@ def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(
         torch.testing.assert_close(*costs, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", shipped_plants())
-def test_the_plants_and_all_that_they_suspect(name):
-    plant = StackedObservations(shipped_plants()[name](), 2)
+@pytest.mark.parametrize("name, observe", [*((name, ()) for name in shipped_plants()), ("wind_turbine", ("measured",))])
+def test_the_plants_and_all_that_they_suspect(name, observe):
+    plant = StackedObservations(shipped_plants()[name](**({"observe": observe} if observe else {})), 2)
     suspects = {**plant.suspects(), **plant.further_suspects()}
     assert suspects.keys() == {**plant.base.suspects(), **plant.base.further_suspects()}.keys()
     n_o, readings = len(plant.base.observations), len(plant.states)
@@ -289,6 +291,21 @@ def test_a_real_system_that_reports_the_states_of_the_plant_alone():
         seen = torch.stack(seen, 1)
         torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
         assert found["done"].all()
+
+
+def test_roscos_simulator_remembers_past_observations():
+    plant = StackedObservations(WindTurbine(horizon=4.0), 2)
+    start, wind, seen = plant.draw_initial_state(1, seeded())[0], 11.0 + 0.1 * torch.arange(8.0), []
+
+    def decide(state, speed, report):
+        seen.append(plant.observe(state.new_tensor(plant.dt * len(seen)), state, state.new_tensor([speed])))
+        return plant.actuate(state, state.new_tensor([3e4, 1.0]))
+
+    answer = Answer(plant, start, wind.numpy(), decide, 5)
+    for step in range(40):
+        answer.call_controller({"rot_speed": 1.0 + 0.002 * step, "ws": 11.0})
+    seen = torch.stack(seen)[None]
+    torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=0.0, atol=0.0)
 
 
 def test_past_observations_are_what_sensors_read_then():

@@ -120,7 +120,8 @@ class Answer:
         if self._step % self._interval == 0:
             k = min(self._step // self._interval, len(self._wind) - 1)
             action = self._decide(self.state, float(self._wind[k]), report)
-            self.state = self.plant.latch(self.state, action)
+            t, exogenous = self.state.new_tensor(STEP * self._step), self.state.new_tensor([self._wind[k]])
+            self.state = self.plant.latch(self.plant.memorise(t, self.state, exogenous), action)
         self._step += 1
         torque, pitch = self.state[4:6].tolist()
         share = self.turbine.cut_in(torch.tensor(self.turbine.gear_ratio * speed, dtype=torch.float64)).item()
