@@ -291,11 +291,14 @@ class VirtualEpisodes:
         self.recorded = record.states[0]
 
     def repeated(self, record: Trajectory) -> Scenario:
-        """The start and the inputs of a real episode, which are continued to the horizon if it ended early."""
-        plant = self.twin.plant
-        acted = record.exogenous[:, : len(plant.acting_inputs)]
-        whole = len(acted) >= plant.n_steps or plant.end_cost is None
-        inputs = record.exogenous if whole else plant.with_previews(continued(acted, plant.n_steps))
+        """The start and the inputs of a real episode, which are continued to the horizon if it ended early.
+
+        Previews stay as they were read: those of the last intervals have seen beyond the end.
+        """
+        plant, inputs = self.twin.plant, record.exogenous
+        if len(inputs) < plant.n_steps and plant.end_cost is not None:
+            acted = continued(inputs[:, : len(plant.acting_inputs)], plant.n_steps)
+            inputs = torch.cat([inputs, plant.with_previews(acted)[len(inputs) :]])
         return Scenario(record.states[:1], inputs[None])
 
     def paired(self, records: Sequence[Trajectory]) -> tuple[list[Trajectory], list[ExogenousProcess]]:
