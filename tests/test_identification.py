@@ -162,6 +162,15 @@ def test_of_segments_that_are_followed_alike_the_longest_stay():
     assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 30 and (closure.matrix == 30.0).all()
 
 
+def test_of_segments_that_different_sensors_prefer_those_of_the_least_misfit_stay():
+    errors, closure = {0: (2.0, 9.0), 2: (9.0, 2.0), 30: (8.0, 2.0)}, LinearClosure(torch.zeros(2, 2))
+
+    def fit(length):
+        return length, torch.tensor(errors.get(length, (9.0, 2.0)))
+
+    assert over_segments(closure, 90, fit, torch.ones(2), lambda: True) == 30
+
+
 class Runaway(Line):
     """ẏ = a y³ − y, which is infinite after 0.73 s for a = 1.3 and y(0) = 1, and decays for a = 0.5."""
 

@@ -128,6 +128,12 @@ def test_times_may_be_durations_and_an_index(tmp_path, suffix, index):
     assert log.times.tolist() == [30.0, 90.5, 3600.0] and log.columns["force"].tolist() == [1.0, 2.0, 3.0]
 
 
+def test_times_with_a_decimal_comma_are_no_durations(tmp_path):
+    (tmp_path / "log.csv").write_text('time,force\n"0,5",1\n"1,0",2\n')
+    with pytest.raises(ValueError, match="'0,5' in row 0"):
+        read_log(tmp_path / "log.csv", PLANT)
+
+
 def test_bad_rows_become_gaps_on_demand():
     force = np.zeros(100)
     force[[30, 31, 32, 33, 60]] = [3.0, np.nan, 3.0, 3.0, np.inf]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from interval_coverage import CASES, LOGS, coverage, logged, recorded
+from seeds_and_numbers import double
 from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
@@ -89,6 +90,29 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         # The slope in the wind of the record is known, that in any other wind is not.
         slopes = torch.tensor([[1.0, wind], [1.0, wind + 1.0]]).double() * closure.by_weight
         assert found.undetermined(slopes).tolist() == [False, True]
+
+
+class Fixed(Slope):
+    """The line's law, of which the slope of the wind is fixed."""
+
+    def __init__(self):
+        super().__init__()
+        self.calm, self.wind = nn.Parameter(self.w[:1].detach()), nn.Parameter(double(0.3), requires_grad=False)
+        del self.w
+
+    def forward(self, features):
+        return self.calm + self.wind * features
+
+    def named_coefficients(self):
+        return {"calm": self.calm[0], "wind": self.wind[0]}
+
+
+def test_a_coefficient_that_is_fixed_has_no_error():
+    records = [sensor_record(Line(), position(), line_segment(1.1 * TIMES + NOISE * noise_of(81, 0), wind=2.0))]
+    uncertainty = Estimation(DigitalTwin(Line(), Fixed()), position()).run(records).uncertainty
+    slope_error = NOISE * math.sqrt(1.0 / ((TIMES - TIMES.mean()) ** 2).sum())
+    assert uncertainty.standard_errors() == pytest.approx({"calm": slope_error, "wind": 0.0})
+    assert not uncertainty.warnings()
 
 
 def regression_error(n, dt, *, smooth):

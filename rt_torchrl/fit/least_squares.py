@@ -161,7 +161,9 @@ def over_segments(
     if not fits:
         raise diverged[0]
     least = torch.stack([errors for _, errors, _ in fits.values()]).amin(0)
-    result, _, weights = next(entry for entry in fits.values() if (entry[1] <= DEPARTURE * least).all())
+    follow = [entry for entry in fits.values() if (entry[1] <= DEPARTURE * least).all()]
+    # The errors of no length are least for all sensors, if those of some grow where those of others fall.
+    result, _, weights = follow[0] if follow else min(fits.values(), key=lambda entry: _misfit(entry[1], enough))
     closure.load_state_dict(weights)
     return result
 

@@ -344,7 +344,8 @@ def _seconds(series: Any, about: str) -> Any:
     pd = pandas()
     text, present = series.astype(str), series.notna()
     dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
-    durations = pd.to_timedelta(text, errors="coerce")
+    # A number without a unit, such as 1,5, would be one of nanoseconds.
+    durations = pd.to_timedelta(text.where(text.str.contains("[:A-Za-z]")), errors="coerce")
     as_dates = dates.notna().sum() >= durations.notna().sum()
     offset = text.str.contains(WITH_OFFSET)
     faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}

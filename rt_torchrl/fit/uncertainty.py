@@ -240,7 +240,9 @@ def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named 
     with torch.enable_grad():
         named = named_values(closure)
         for value in named.values():
-            slopes = torch.autograd.grad(value, weights, retain_graph=True, allow_unused=True, materialize_grads=True)
+            slopes = [torch.zeros_like(w) for w in weights]
+            if value.requires_grad:  # one that is fixed does not
+                slopes = torch.autograd.grad(value, weights, retain_graph=True, materialize_grads=True)
             rows.append(torch.cat([slope.flatten() for slope in slopes]))
     count = sum(w.numel() for w in weights)
     return list(named), torch.stack(rows) if rows else torch.empty(0, count, dtype=torch.float64)
