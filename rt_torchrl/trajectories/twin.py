@@ -118,7 +118,7 @@ class DigitalTwin:
         if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
             self._read = ReadInterval(self.plant, self.closure, None)
         ends = Native().end_states(self._read, start, drive)
-        require_finite(self.plant, ends, start, [self.closure])
+        require_finite(self.plant, ends, start, [self.closure], start=record.start)
         return torch.cat([start, ends[:, 0]])
 
     def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Trajectory:
