@@ -1,5 +1,6 @@
 """Kinds of things that traced code reads and a user may change, from ``data/changes.txt``, and the things."""
 
+import array
 import collections
 import contextvars
 import copy
@@ -21,7 +22,7 @@ from torch import nn
 from traced_function import sections
 
 SCALE, TEXT, PAIR = 0.1, "0.1", (0.1, 1.0)
-READ_BY_THE_TABLE = (os,)
+READ_BY_THE_TABLE = (os, array)
 NUMBERS, ARRAY = torch.tensor([0.1], dtype=torch.float64), np.array([0.1])
 CONFIG, NESTED, LIST, GROUP, QUEUE = {"scale": 0.1}, ({"scale": 0.1},), [0.1], {0.1}, collections.deque([0.1])
 NAMESPACE, CONTEXT = types.SimpleNamespace(scale=0.1), contextvars.ContextVar("scale", default=0.1)

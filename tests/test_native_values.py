@@ -89,6 +89,11 @@ def test_special_values_of_operators(name):
     assert_same((lambda x, y: one(x).double()) if one else (lambda x, y: two(x, y).double()))
 
 
+def test_special_values_of_whole_quotients():
+    assert_same(torch.floor_divide)
+    assert_same(lambda x, y: torch.div(x, 0.1, rounding_mode="floor"))
+
+
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(trees())
 def test_special_values_of_expressions(tree):

@@ -11,6 +11,7 @@ Whatever else code reads becomes a constant of it:
 """
 
 import argparse
+import array
 import collections
 import contextvars
 import dataclasses
@@ -59,7 +60,7 @@ WRAPPERS = (
     *(functools.partial, type(lru_cache(max))),
 )
 """Types of functions and of what holds one."""
-MAPPINGS, SEQUENCES = (dict, types.MappingProxyType), (list, set, collections.deque, bytearray)
+MAPPINGS, SEQUENCES = (dict, types.MappingProxyType), (list, set, collections.deque, bytearray, array.array)
 PARTS = {
     types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"),
     types.MethodType: ("__func__", "__self__"),

@@ -296,9 +296,9 @@ class Tracer(TorchDispatchMode):
         operands = [self.cells(a) for a in args[: ARITY[name]]]
         if (alpha := kwargs.get("alpha", 1)) != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)
-        cells = self.pointwise(name, operands, out.shape)
         rounding = kwargs.get("rounding_mode")
-        return self.pointwise(rounding, [cells], out.shape) if rounding else cells
+        cells = self.pointwise("floor_divide" if rounding == "floor" else name, operands, out.shape)
+        return self.pointwise("trunc", [cells], out.shape) if rounding == "trunc" else cells
 
     def pointwise(self, name: str, operands: list[Tensor], shape: Iterable[int]) -> Tensor:
         """The cells of an elementwise operator on cells: straight-line code, or one loop over a long row."""
