@@ -26,6 +26,7 @@ from rt_torchrl import (
 )
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.fit.sensors import known_sensors, read, read_slopes
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run import Run
 from rt_torchrl.steps.inputs import VirtualEpisodes
@@ -94,6 +95,28 @@ def test_a_filter_of_the_position_tells_the_speed_behind_it():
     torch.testing.assert_close(plant.seen_velocity(states[-1:])[0], -seen[2:4])
     start = plant.controller_start(double(0.3, 1.2, 0.0, 0.0), torch.zeros(1).double())
     assert start.tolist() == [0.3, 1.2]
+
+
+@pytest.mark.parametrize("name, kind, which", CHOICES, ids=IDS)
+def test_slopes_of_all_sensors_are_those_of_finite_differences(name, kind, which):
+    plant = kind(observe=(which,))
+    sensors, t = tuple(known_sensors(plant).values()), double(0.0, 1.0).expand(3, 2)
+    state = torch.stack([plant.draw_initial_state(3, seeded(k)) for k in range(2)], 1)
+    inputs = plant.draw_exogenous(3, seeded())[:, :2]
+    slopes = read_slopes(sensors, plant, t, state, inputs)
+    for k in range(len(plant.states)):
+        step = torch.zeros_like(state)
+        step[..., k] = 1e-6 * (1e-3 + state[..., k].abs().max())
+        ahead, behind = (read(sensors, plant, t, state + sign * step, inputs) for sign in (1.0, -1.0))
+        difference = (ahead - behind) / (2.0 * step[..., k, None])
+        torch.testing.assert_close(slopes[..., k], difference, rtol=1e-4, atol=1e-5)
+
+
+def test_rates_by_filters_have_no_sensor_where_the_plant_has_no_filters():
+    assert "speed_rate" in known_sensors(WindTurbine(observe=("speed_rate",)))
+    assert "speed_rate" not in known_sensors(WindTurbine())
+    assert "filtered_rate_x" in known_sensors(FlappingWing(observe=("position",)))
+    assert "filtered_rate_x" not in known_sensors(FlappingWing())
 
 
 # Previews

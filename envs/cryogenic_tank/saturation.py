@@ -68,11 +68,12 @@ class Saturation(nn.Module):
     def with_slopes(self, p: Float[Tensor, "*batch"]) -> tuple[Properties, Properties]:
         """Properties at the pressure p [Pa] and their derivatives along the saturation line [unit/Pa]."""
         x = torch.log(p / self.low) / self._width
-        x = torch.where(self._within(p), x, math.nan)
+        # An index of no dimension is a number of Python, which Jacobians of one state do not have.
+        x = torch.where(self._within(p), x, math.nan).unsqueeze(-1)
         # The integer is clamped, which loses no derivative, because a NaN has no defined value as an index.
         cell = x.floor().long().clamp(0, CELLS - 1)
-        u = (x - cell).unsqueeze(-1)
-        c = self.table[cell]
+        u = x - cell
+        c = self.table[cell].squeeze(-3)
         value, slope = c[..., DEGREE, :], torch.zeros_like(c[..., DEGREE, :])
         for power in range(DEGREE - 1, -1, -1):
             slope = slope * u + value

@@ -233,6 +233,8 @@ class FlappingWing(Plant):
         self.cost = TrackingCost() if cost is None else cost
         held = FILTERED if any(measurement in OF_FILTERED for measurement in self.observed) else ()
         self.filtered = len(held)
+        if not held:
+            self.measurements = tuple(m for m in self.measurements if m not in OF_FILTERED)
         self.states, self.controller_states = (*POSITIONS, *SPEEDS, *held), tuple(signal.name for signal in held)
         self.register_buffer("target", torch.tensor(target, dtype=torch.float64))
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))

@@ -205,6 +205,8 @@ class WindTurbine(Plant):
         if any(measurement in OF_FAST_SPEED for measurement in self.observed):
             self.states = (*STATES, FAST_SPEED)
             self.controller_states = tuple(signal.name for signal in self.states[1:])
+        else:
+            self.measurements = tuple(m for m in self.measurements if m not in OF_FAST_SPEED)
         if not inertia > 0:
             raise ValueError(f"inertia={inertia} kg m² must be positive.")
         self.wind = KaimalWind() if wind is None else wind

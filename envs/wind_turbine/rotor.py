@@ -110,14 +110,13 @@ class PowerCoefficientTable(nn.Module):
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
         """C_p [-] at the features, tip-speed ratio λ [-] and pitch β [deg], in the module's dtype (float64)."""
         # The search needs contiguous memory; Tensor.contiguous does not see the batch dimension of torch.func.vmap.
-        lam, beta = (features[..., k].clone(memory_format=torch.contiguous_format) for k in (0, 1))
+        lam, beta = (x.clone(memory_format=torch.contiguous_format) for x in features.split(1, -1))
         i = torch.bucketize(lam, self._lam_knots, right=True)
         j = torch.bucketize(beta, self.pitch, right=True)
         c = self._coefficients[i, j]
-        x = (lam - self._lam_origins[i]).unsqueeze(-1)
-        y = (beta - self._beta_origins[j]).unsqueeze(-1)
+        x, y = lam - self._lam_origins[i], (beta - self._beta_origins[j]).unsqueeze(-1)
         in_lam = ((c[..., 3] * y + c[..., 2]) * y + c[..., 1]) * y + c[..., 0]
-        c0, c1, c2, c3 = in_lam.split(1, dim=-1)
+        c0, c1, c2, c3 = in_lam.unbind(-1)
         return ((c3 * x + c2) * x + c1) * x + c0
 
     @torch.no_grad()
