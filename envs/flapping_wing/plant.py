@@ -181,7 +181,7 @@ class FlappingWing(Plant):
     actions = ACTIONS
     inputs = (HEADWIND,)
     # ℓ = 2 m and v = 1 m/s: with these, good policies have weights of 1 to 2, which suit one learning rate.
-    measurements = (
+    measurements: tuple[Measurement, ...] = (
         Measurement(symbol="e_x", name="error_x", unit="m", read=partial(error, 0), scale=2.0),
         Measurement(symbol="e_z", name="error_z", unit="m", read=partial(error, 1), scale=2.0),
         Measurement(symbol=r"\dot e_x", name="error_rate_x", unit="m/s", read=partial(error_rate, 0)),

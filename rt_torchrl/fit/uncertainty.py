@@ -240,7 +240,7 @@ def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named 
     with torch.enable_grad():
         named = named_values(closure)
         for value in named.values():
-            slopes = [torch.zeros_like(w) for w in weights]
+            slopes = tuple(torch.zeros_like(w) for w in weights)
             if value.requires_grad:  # one that is fixed does not
                 slopes = torch.autograd.grad(value, weights, retain_graph=True, materialize_grads=True)
             rows.append(torch.cat([slope.flatten() for slope in slopes]))
