@@ -26,13 +26,13 @@ def turbine(tmp_path_factory):
     return path
 
 
-def environment(path, **options):
+def environment(path, plant=PLANT, **options):
     given = {
         "actions": [f"command.{s.name}" for s in PLANT.actions],
         "outputs": [f"state.{s.name}" for s in PLANT.states],
         "exogenous": ["exogenous.wind_speed"],
     }
-    return FMUEnvironment(path, PLANT, **given | options)
+    return FMUEnvironment(path, plant, **given | options)
 
 
 @needs_compiler
@@ -152,6 +152,13 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
         made.step(entries.set("action", torch.tensor([41000.0, 0.0]).double()))
     assert made.reset()["outputs"].tolist() == [1.0]
     made.close()
+
+
+@needs_compiler
+def test_an_fmu_takes_the_inputs_that_act_and_no_previews(turbine):
+    seen = WindTurbine(horizon=20.0, observe=("preview",))
+    entries = environment(turbine, seen).reset()
+    assert entries["exogenous"].shape == (len(seen.inputs),) and len(seen.inputs) > 1
 
 
 @needs_compiler

@@ -24,6 +24,7 @@ from rt_torchrl import (
     RealSystem,
     RunConfig,
     SafetyLayer,
+    Snapshot,
 )
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.real_side import learner_threads
@@ -139,11 +140,11 @@ LIMITS = OperatingLimitsConfig(states={"velocity": (-9.0, 9.0)}, actions={"force
 PLANT = LinearQuadratic(horizon=3.0)
 
 
-def machine(injections=(), **options):
+def machine(injections=(), fallback=(0.0,), **options):
     """The oracle plant behind a safety layer, with faults, as a real system; the plant itself goes on for long."""
     system = FaultySystem(PlantEnv(LinearQuadratic(horizon=300.0), seed=0), injections)
     config = SafetyConfig(interval=PLANT.dt, frozen={"state": (5, 0)}, **options)
-    layer = SafetyLayer(system, config, fallback=(0.0,))
+    layer = SafetyLayer(system, config, fallback=fallback)
     state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
     return RealSystem(layer, PLANT, state=state, exogenous=exogenous, applied=applied, closure=PLANT.closure)
 
@@ -180,6 +181,8 @@ def test_a_fault_costs_its_own_intervals_alone(injection, kind, kept, continuous
         reports.append(found.episode())
         stored.append(len(found.learner.memory))
         require_true(PLANT, found.short_term[-1])
+        snapshot = Snapshot.take(found, found.twin.closure, [])
+        assert len(snapshot.large_scale) == len(snapshot.record.actions)
     assert reports[1][f"faults/{kind}"] == 1 and reports[1]["sound_intervals"] == kept
     assert [b - a for a, b in zip([0, *stored], stored, strict=False)] == [30, kept, 30]
 
@@ -194,14 +197,43 @@ def test_a_reading_refused_at_the_end_of_a_window_is_not_the_start_of_the_next()
     assert stored == [30, 59, 88]
 
 
+class Clock(torch.nn.Module):
+    """State feedback that keeps the times at which it acted, and has nothing to report before."""
+
+    begin = fly = lambda self: None
+
+    def __init__(self):
+        super().__init__()
+        self.times = []
+
+    def act(self, t, state, exogenous):
+        self.times.append(round(t / PLANT.dt))
+        return torch.zeros(1, 1).double()
+
+    def report(self):
+        return {"last": float(self.times[-1])}
+
+
+def test_a_fallback_has_the_clock_of_the_window():
+    fallback = Clock()
+    found = operated(machine(fallback=fallback), continuous=True)
+    for _ in range(2):
+        found.episode()
+    assert fallback.times == [*range(30)] * 2
+
+
 class Unreachable(PlantEnv):
-    """A system that fails in its third reset."""
+    """A system that fails in one of its resets, which are counted from 1."""
 
     resets = 0
 
+    def __init__(self, plant, fails=3):
+        super().__init__(plant)
+        self.fails = fails
+
     def _reset(self, *args, **options):
         self.resets += 1
-        if self.resets == 3:
+        if self.resets == self.fails:
             raise ConnectionError("no answer")
         return super()._reset(*args, **options)
 
@@ -212,6 +244,15 @@ def test_a_reset_that_fails_is_tried_again():
     assert reports[2]["episodes_refused"] == 1
     assert "failed in its reset: ConnectionError: no answer" in reports[2]["refusal"]
     assert [fault.kind for fault in found.flights.faults] == [] and reports[3]["windows"] == 1
+
+
+def test_state_feedback_that_has_not_acted_reports_nothing():
+    found = InProcess(PLANT, {"one": Clock()}, QUIET, Unreachable(PLANT, fails=1))
+    found.hand_over("one", Clock(), strength=0.0)
+    with pytest.raises(EpisodeEndedError, match="failed in its reset: ConnectionError: no answer"):
+        found.rollout()
+    found.rollout()
+    assert found.acted == {"last": 29.0}
 
 
 # An operation in a process of its own, with true clocks, and whole runs of it.

@@ -14,7 +14,7 @@ from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl import PlantEnv, Reading, RealSystem, SafetyConfig
-from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, layer_of
+from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, Watchdog, layer_of
 from rt_torchrl.systems.sound_part import report_of
 
 DT = 0.1
@@ -133,6 +133,19 @@ def test_one_fault_brings_the_fallback_for_one_interval(options, asked, expected
     assert episode["next", "refused"].sum() == len(options.get("broken", ()))
     if "value" in options:
         assert episode["next", "observation"][0, 3, 0] == 7.0
+
+
+@pytest.mark.parametrize("t", [0.0, 9e6, 3e9])
+def test_a_fault_trips_however_long_a_system_has_run(t):
+    for hold, expected in ((0.0, [True, False, False]), (7200.0, [True, True, False])):
+        watchdog = Watchdog(SafetyConfig(interval=3600.0, hold=hold))
+        watchdog.note(t, faulty=True)
+        assert [watchdog.tripped(t + 3600.0 * k) for k in range(3)] == expected
+
+
+def test_the_fallback_begins_where_a_system_begins_beyond_its_limits():
+    env = layer(fallback=(-1.0,), limits={"state": (1e3, 1e4)})
+    assert env.reset()["tripped"].item() and applied(fly(env, [0.5] * 20)) == [-1.0] * 20
 
 
 def test_a_controller_as_fallback_sees_the_last_finite_observation():

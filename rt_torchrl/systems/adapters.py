@@ -194,7 +194,8 @@ class FMUEnvironment(ForeignSystem):
         plant: plant that gives the control interval, the ranges of the actions, and draws the exogenous inputs.
         actions: variables of the FMU that take the actions, in the plant's order.
         outputs: variables that are reported.
-        exogenous: variables that take the plant's exogenous inputs, in its order; empty for an FMU that has its own.
+        exogenous: variables that take the inputs that act on the plant, in its order; empty for an FMU that has its
+            own.
         start: function that draws what variables are set to before an episode; None leaves the FMU's own values.
         seed: seed of the first episode, until ``set_seed`` gives another; each later episode adds 1.
 
@@ -221,8 +222,8 @@ class FMUEnvironment(ForeignSystem):
         if len(actions) != len(plant.actions):
             count = len(plant.actions)
             raise ValueError(f"actions={tuple(actions)} must name {count} variables, one for each of the plant's.")
-        if exogenous and len(exogenous) != len(plant.inputs):
-            raise ValueError(f"exogenous={tuple(exogenous)} must name {len(plant.inputs)} variables, or none.")
+        if exogenous and len(exogenous) != (count := len(plant.acting_inputs)):
+            raise ValueError(f"exogenous={tuple(exogenous)} must name {count} variables, or none.")
         self._require({"actions": actions, "outputs": outputs, "exogenous": exogenous})
         self._actions, self._outputs, self._exogenous = tuple(actions), tuple(outputs), tuple(exogenous)
         self._start, self._steps = start, 0

@@ -280,13 +280,13 @@ def flown(
     """
     ends = plant.ended(states[1:]).any(-1)
     n = int(ends.int().argmax()) + 1 if ends.any() else len(command)
+    # There is no input after the last interval of the horizon; the last input takes its place.
+    exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])[: n + 1]
     states, factors, command = states[: n + 1], factors[: n + 1], command[:n]
     drive, over = Drive(*(values[:n] for values in drive)), ends[n - 1]
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
     reward[-1] -= ~over * plant.terminal_cost(states[-1]) / plant.dt
-    # There is no input after the last interval; the last input takes its place.
-    exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
     measured = states * factors
     entries = {"state": measured[..., : len(plant.readings)], "exogenous": exogenous}

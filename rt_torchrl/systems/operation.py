@@ -120,12 +120,12 @@ class Pace:
         if not period > 0.0:
             raise ValueError(f"period={period} s of a control loop must be positive.")
         self.period, self._clock, self._sleep = period, clock, sleep
-        self.late = 0.0
-        self._due: float | None = None
+        self._due: float | None
+        self.begin()
 
     def begin(self) -> None:
         """Begin anew: the next interval is due at once."""
-        self._due = None
+        self._due, self.late = None, 0.0
 
     def shift(self, seconds: float | None) -> None:
         """Move all intervals to come by some time [s]; with None the present moment is when this one was due."""
@@ -239,9 +239,11 @@ class Operator:
 
         rows, why = fly(self.env, self._begin, act, self.plant)
         self._begun = self.config.continuous and why is None
+        if not rows:
+            return Window(rows, why)
         policy = self.actor.policy
         acted = policy.report() if isinstance(policy, StateFeedback) else None
-        return Window(rows, why, report_of(self.env), acted) if rows else Window(rows, why)
+        return Window(rows, why, report_of(self.env), acted)
 
     def _begin(self) -> TensorDictBase:
         """Begin a window, and return what is read first."""

@@ -27,7 +27,9 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen"})
 """Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
 ROUNDING = 1e-9
-"""Slack in comparisons of times that are sums of intervals [s], and share of a rate by which rounding may exceed it."""
+"""Share of an interval or a rate by which rounding may exceed it."""
+SLACK = 1e-6
+"""Slack in comparisons of times that are sums of many intervals, as a share of an interval."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor] | StateFeedback
 Ends = tuple[tuple[float, ...], tuple[float, ...]]
@@ -190,11 +192,11 @@ class Watchdog:
         """Take note of an observation at time t of the episode [s] and whether it was faulty."""
         if faulty:
             # Without a hold time the watchdog is tripped for the interval that begins now.
-            self._until = t + max(self.config.hold, 2.0 * ROUNDING)
+            self._until = t + max(self.config.hold, 0.5 * self.config.interval)
 
     def tripped(self, t: float) -> bool:
         """Whether the fallback acts in the interval that begins at t [s]."""
-        return t < self._until - ROUNDING
+        return t < self._until - SLACK * self.config.interval
 
 
 class SafetyLayer(AroundSystem):
@@ -304,7 +306,7 @@ class SafetyLayer(AroundSystem):
         reading = self._remember(reading)
         if "applied" not in reading:  # the machine need not say what it has applied
             reading["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
-        reading["tripped"], reading["refused"] = self._flag(False), self._flag(False)
+        reading["tripped"], reading["refused"] = self._flag(self.watchdog.tripped(0.0)), self._flag(False)
         return reading
 
     def begin_window(self) -> None:
@@ -344,8 +346,9 @@ class SafetyLayer(AroundSystem):
             self.watchdog.note(t, True)
         tripped = self.watchdog.tripped(t)
         other = self._fallback
-        if isinstance(other, StateFeedback):
-            other = other.act(t, tensordict["state"], tensordict["exogenous"])
+        if isinstance(other, StateFeedback):  # whose clock begins anew in each window
+            clock = self._step_count * self.config.interval
+            other = other.act(clock, tensordict["state"], tensordict["exogenous"])
         elif callable(other) and (tripped or hasattr(other, "begin")):
             other = other(tensordict)
         if tripped:
