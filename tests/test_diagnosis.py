@@ -131,9 +131,13 @@ def test_a_class_that_sees_too_little_is_too_small(tmp_path):
 
 
 def test_an_alarm_is_a_twin_that_is_wrong(run):
-    rewrite(run, lambda metrics: metrics["episodes"][-1].update(alarm=1.0, warning="the last 2 episodes cost too much"))
+    def diverged(metrics):  # under what had flown; then no difference is known
+        metrics["episodes"][-1] |= {"alarm": 1.0, "warning": "the twin diverges"}
+        del metrics["episodes"][-1]["paired_difference"]
+
+    rewrite(run, diverged)
     reason = diagnose(run)[TWIN]
-    assert reason.holds and reason.evidence == "the last 2 episodes cost too much"
+    assert reason.holds and reason.evidence == "the twin diverges"
     rewrite(run, lambda metrics: metrics["episodes"][-1].update(alarm=0.0, warning=None, paired_difference=0.7))
     reason = diagnose(run)[TWIN]
     assert reason.holds is False and "cost 2.01 times what the twin says" in reason.evidence

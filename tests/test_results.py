@@ -21,7 +21,15 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.metrics import read_metrics
-from rt_torchrl.runs.results import closure_lines, dearer_than_first, fit_lines, next_steps, results_table
+from rt_torchrl.runs.results import (
+    alarm_lines,
+    closure_lines,
+    cost_of_learning,
+    dearer_than_first,
+    fit_lines,
+    next_steps,
+    results_table,
+)
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
 
@@ -220,6 +228,13 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
     record |= {f"rms/{name}": value for name, value in rms.items()}
     assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
+
+
+def test_every_window_is_paid_and_episodes_are_counted_from_one():
+    episodes = [{"episode": 0, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 1, "real_cost": 1.0}]
+    assert cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
+    lines = alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
+    assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]
 
 
 @pytest.mark.parametrize(("episodes", "summary"), [({}, {}), ([1], {}), ([], None), (None, {})])

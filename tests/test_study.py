@@ -1,5 +1,7 @@
 """Finished runs beside each other, and the study that makes them: numbers by hand, and small trainings."""
 
+import dataclasses
+import itertools
 import json
 import math
 import os
@@ -115,6 +117,9 @@ def test_ratios_are_those_of_common_seeds_with_positive_costs(costs, others, exp
 def test_what_diverges_costs_infinitely(tmp_path):
     run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[1.0, NAN], curve=(NAN, 1.0)))
     assert run.cost == math.inf and run.curve == [math.inf, 1.0] and sum(run.real) == math.inf
+    for merits in itertools.permutations((1.0, math.nan, 3.0)):  # in whatever order the folders are given
+        row = Row(name="a", runs=[dataclasses.replace(run, merit={"power [W]": merit}) for merit in merits])
+        assert math.isnan(row.numbers(row)["merit"]["power [W]"])
     row = cells(Comparison("tanks", [Row(name="a", runs=[run], optimum=1.0)]).table())["a"]
     assert row[2] == row[4] == row[5] == "inf" and row[6] == "2"  # near the optimum after the second episode
     comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()

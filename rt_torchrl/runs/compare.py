@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics
+from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics, real_costs
 from rt_torchrl.runs.settings import BESIDE, BESIDE_TRAINING, flat, read_settings, task_of
 from rt_torchrl.steps.config import Role
 
@@ -95,7 +95,7 @@ class FinishedRun:
             costs=_numbers(unseen["costs"][live]),
             curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
             judged=judged,
-            real=_numbers(episode["real_cost"] for episode in episodes),
+            real=_numbers(real_costs(episodes)),
             merit=_means(unseen["merit"][live]),
             controllers={
                 name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(baseline["merit"]))
@@ -164,7 +164,7 @@ class Row:
             "episodes_to_optimum": spread(self.episodes_to_optimum),
             "alarms": spread([float(run.alarms) for run in self.runs]),
             "seconds": spread([run.seconds for run in self.runs]),
-            "merit": {name: statistics.median(run.merit[name] for run in self.runs) for name in self.runs[0].merit},
+            "merit": {name: float(np.median([run.merit[name] for run in self.runs])) for name in self.runs[0].merit},
             "curves": [run.curve for run in self.runs],
         }
 

@@ -86,9 +86,9 @@ def _twin(run: LoadedRun) -> Reason:
     flown = [entry for entry in run.metrics["episodes"] if entry.get("alarm") is not None]
     if not flown:
         return Reason(name, None, "no real episode was flown again on the twin", remedy)
-    ratio = math.exp(flown[-1]["paired_difference"])
-    evidence = flown[-1].get("warning") or f"the last real episode cost {ratio:.3g} times what the twin says"
-    return Reason(name, bool(flown[-1]["alarm"]), evidence, remedy)
+    last, words = flown[-1], "the last real episode cost {:.3g} times what the twin says"
+    evidence = last.get("warning") or words.format(math.exp(last["paired_difference"]))
+    return Reason(name, bool(last["alarm"]), evidence, remedy)
 
 
 def _classical(run: LoadedRun) -> Reason:

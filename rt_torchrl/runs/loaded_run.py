@@ -193,7 +193,7 @@ class LoadedRun:
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
         segment = self.metrics["summary"]["twin"]["segment"]
         process, signals = None, self.physics.acting_inputs
-        if self.config.twinning.arm != "model_free" and signals:
+        if self.config.twinning.arm != "model_free":
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
 
             acted = read.exogenous[:, : len(signals)]
@@ -202,7 +202,7 @@ class LoadedRun:
             )
         return Snapshot(
             plant=self.physics,
-            known=self.physics is self.plant,
+            true_closure=None if self._only_on_the_twin else self.true_closure(),
             closure=self.twin.believed_law,
             initial_closure=self.initial_closure,
             policies={role: self.policy(role) for role in ("model_free", "model_based")},

@@ -18,7 +18,7 @@ from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin
+from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin, real_costs
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -200,8 +200,8 @@ def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | N
         episodes: records of the training.
         judging: J_a of the flights on the real system after it, which count as well; None for one that is not finite.
     """
-    costs = [record[key] for record in episodes for key in ("start_cost", "real_cost") if key in record]
-    costs += [torch.inf if cost is None else cost for cost in judging]
+    costs = [record["start_cost"] for record in episodes if "start_cost" in record]
+    costs += [torch.inf if cost is None else cost for cost in (*real_costs(episodes), *judging)]
     paid = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
     return paid | ({"judging": list(judging)} if judging else {})
 
@@ -411,8 +411,8 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
         return []
     raised = sum(record["alarm"] > 0.0 for record in watched)
     text = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
-    last = [f"  episode {record['episode']}: {record['warning']}" for record in watched if record.get("warning")][-1:]
-    return [f"  {text}", *last]
+    warned = [record for record in watched if record.get("warning")][-1:]
+    return [f"  {text}", *(f"  episode {record['episode'] + 1}: {record['warning']}" for record in warned)]
 
 
 def dearer_than_first(summary: Mapping[str, Any]) -> str:

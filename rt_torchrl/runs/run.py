@@ -126,6 +126,7 @@ class Run:
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
+                self.started -= sum(results.seconds_per_step(self.episodes).values())
             elif real is not None and config.preflight:
                 self.algorithm.flights.check = self._require_wiring
             self._doubts: tuple[str, ...] = ()

@@ -250,7 +250,7 @@ class RunConfig:
             self,
             quick=False,
             episodes=min(self.episodes, QUICK_EPISODES),
-            unseen=QUICK_UNSEEN,
+            unseen=min(self.unseen, QUICK_UNSEEN),
             real_unseen=min(self.real_unseen, QUICK_UNSEEN),
             twinning=twinning,
         )
