@@ -19,7 +19,7 @@ def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapsh
         replayed = Rollout(plant, twin)(start, exogenous, flown.actions)
     return Snapshot(
         plant=plant,
-        known=True,
+        true_closure=plant.closure,
         closure=twin,
         initial_closure=plant.make_closure(generator),
         policies=policies,

@@ -140,7 +140,7 @@ def test_both_collectors_fly_the_same_episode_to_its_end():
     )
     assert one.shape == other.shape and one.shape[1] < plant.n_steps
     assert one["next", "terminated"].flatten().tolist() == [False] * (one.shape[1] - 1) + [True]
-    ends = [("next", key) for key in ("reward", "done", "terminated", "truncated")]
+    ends = [("next", key) for key in ("reward", "done", "terminated", "truncated", "exogenous", "observation")]
     for key in ("state", "observation", "action", *ends):
         # Machine code rounds differently.
         torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-12)
@@ -185,12 +185,14 @@ def test_a_training_learns_from_episodes_of_unequal_length(system):
     env = PlantEnv(plant, seed=1) if system == "simulation" else connected(plant, rig=Rig(plant, seed=1))
     found = algorithm(env, plant, config)
     reports = [found.episode()]
+    resumed = algorithm(env, plant, config)
+    resumed.load_state_dict(found.state_dict())
+    snapshot = Snapshot.take(
+        resumed, plant.make_closure(torch.Generator().manual_seed(0)), [episode_record(reports[0], episode=0)]
+    )
+    n = len(found.short_term[-1].actions)
+    assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
     if system == "simulation":
-        snapshot = Snapshot.take(
-            found, plant.make_closure(torch.Generator().manual_seed(0)), [episode_record(reports[0], episode=0)]
-        )
-        n = len(found.short_term[-1].actions)
-        assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
         assert {"states", "exogenous"} <= figures_of(snapshot).keys()
     reports += [found.episode() for _ in range(4)]
     lengths = [len(flown.trajectory.actions) for flown in found.belief.flown]

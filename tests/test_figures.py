@@ -1,6 +1,7 @@
 """Figures against the numbers they are drawn from, on snapshots of short trainings and on flights."""
 
 import copy
+import math
 import sys
 from dataclasses import replace
 
@@ -95,6 +96,20 @@ def test_states_are_record_and_replay_with_units_and_residual(name, request):
     residual = (snapshot.replay[:, 0] - snapshot.record.states[:, 0]).square().mean().sqrt()
     assert figure.axes[0].get_title(loc="right") == f"RMS {residual:.2g} {plant.states[0].unit}"
     assert "time [s]" in draw(figure)
+
+
+def test_an_error_of_a_whole_turn_is_none(oscillator):
+    plant, turn = copy.deepcopy(oscillator.plant), {"low": -math.pi, "high": math.pi, "periodic": True}
+    plant.states = tuple(replace(signal, **turn) for signal in plant.states)
+    turned = replace(oscillator, plant=plant, replay=oscillator.record.states + 2.0 * math.pi)
+    assert [ax.get_title(loc="right") for ax in figures.states(turned).axes] == ["RMS 0 m", "RMS 0 m/s"]
+
+
+def test_observations_of_a_part_have_the_times_of_the_episode(oscillator):
+    plant = copy.deepcopy(oscillator.plant)
+    plant.observe = lambda t, state, exogenous: t.unsqueeze(-1)
+    part = replace(oscillator, plant=plant, record=oscillator.record._replace(start=1.0))
+    assert visited_observations(part)[0].item() == 1.0
 
 
 def test_exogenous_shows_record_mean_and_samples(turbine):

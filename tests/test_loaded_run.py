@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import runpy
+import shutil
 import sys
 
 import pytest
@@ -16,6 +17,7 @@ from test_classical import PD
 from test_documentation import leave_finished_run
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
+from test_predictive_control import Undisturbed
 
 from rt_torchrl import HypothesesConfig, RunConfig, SaturatedMLP, load_run
 from rt_torchrl.options import choices
@@ -316,6 +318,13 @@ def test_figures_show_the_episode_that_is_given(run):
     assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy()) and "twin" in drawn
     assert any(word.startswith("Real and twin states, one flight") for word in draw(run.figure("states", flown)))
     assert {"states", "learning_curves", "power_and_speed"} <= set(run.figure_names())
+
+
+def test_a_twin_of_a_plant_without_inputs_was_trained_all_the_same(run, tmp_path):
+    plant = Undisturbed(horizon=2.0)
+    leave_run_of(tmp_path, RunConfig(log_dir=tmp_path), plant)
+    shutil.copy(run.folder / "metrics.json", tmp_path)
+    assert "twin" in draw(load_run(tmp_path, plant=plant).figure("states"))
 
 
 def test_figures_call_a_flight_on_the_twin_so(run):

@@ -13,7 +13,16 @@ from tensordict.nn import TensorDictModule
 from test_hypotheses import LAG, Suspecting
 from torchrl.collectors import Collector
 
-from rt_torchrl import ExplorationConfig, LaggedActuator, PlantContractError, Rollout, RunConfig, identification_cost
+from rt_torchrl import (
+    ExplorationConfig,
+    LaggedActuator,
+    PlantContractError,
+    Rollout,
+    RunConfig,
+    Snapshot,
+    identification_cost,
+)
+from rt_torchrl.figures import style
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
@@ -84,6 +93,7 @@ def test_the_twin_follows_a_system_that_wears(tmp_path):
     torch.testing.assert_close(closures[0], torch.tensor(LinearQuadratic.true_closure), rtol=0, atol=1e-6)
     assert closures[1].abs().max() < 1e-6 and closures[2].abs().max() < 1e-6
     assert found["summary"]["closure"]["true"] == {"matrix": [[0.0, 0.0], [0.0, 0.0]]}
+    assert not style.closures(Snapshot.take(run.algorithm, run.initial_closure, []))["true"].matrix.any()
 
 
 def test_a_twin_may_believe_in_another_plant(tmp_path):
@@ -105,6 +115,8 @@ def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
     whole = small_run(tmp_path / "whole", episodes=4, twinning=FULL).train()
     small_run(tmp_path / "parts", episodes=2, twinning=FULL).train()
     parts = small_run(tmp_path / "parts", episodes=4, resume=True, twinning=FULL).train()
+    *steps, total = parts["summary"]["seconds"].values()
+    assert sum(steps) < total
     assert_same(whole, parts)
 
 
@@ -179,7 +191,8 @@ def interrupted_in(episode, monkeypatch):
 def test_quick_is_a_small_run(tmp_path):
     effective = RunConfig(quick=True, log_dir=tmp_path).effective()
     assert (effective.episodes, effective.unseen, effective.twinning.learner.critic_iterations) == (3, 5, 200)
-    assert RunConfig(quick=True, episodes=2).effective().episodes == 2
+    fewer = RunConfig(quick=True, episodes=2, unseen=3).effective()
+    assert (fewer.episodes, fewer.unseen) == (2, 3)
 
 
 def test_an_unwritable_folder_is_refused(tmp_path):

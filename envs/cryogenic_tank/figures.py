@@ -32,7 +32,7 @@ def tank(snapshot: Snapshot) -> Figure:
     tank and at most its height again above and below it, so that a twin that is far off leaves them.
     """
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
-    real = _quantities(plant, record.states, record.actions, plant.closure)
+    real = _quantities(plant, record.states, record.actions, style.closures(snapshot)["true"])
     twin = _quantities(plant, snapshot.replay, record.actions, snapshot.closure)
     group = -(-len(record.actions) // POINTS)
     note = f"\nmean and range of every {group * plant.dt / 60.0:g} min" if group > 1 else ""

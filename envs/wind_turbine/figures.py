@@ -86,7 +86,7 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
         drawn = ax.pcolormesh(array(lams), array(betas), C_p[name], shading="gouraud", vmin=0.0, vmax=0.5)
         lines = ax.contour(array(lams), array(betas), C_p[name], CONTOURS, colors="white", linewidths=0.8)
         ax.clabel(lines, fontsize=8)
-    caption(table, "true $C_p$ [-]" if snapshot.known else "$C_p$ of the plant's own table [-]")
+    caption(table, "$C_p$ of the plant's own table [-]" if snapshot.true_closure is None else "true $C_p$ [-]")
     caption(law, "$C_p$ of the twin [-]")
     figure.colorbar(drawn, ax=[table, law], extend="both", pad=0.01)
     ends: dict[str, Any] = {"cmap": "RdBu", "vmin": -GREATEST_SHOWN, "vmax": GREATEST_SHOWN}

@@ -20,8 +20,8 @@ class Snapshot:
     """State of a training after an episode, from which every figure is drawn.
 
     Args:
-        plant: plant with the true closure, if that is known.
-        known: whether the true closure is known; that of a real system may not be.
+        plant: physics of the twin.
+        true_closure: the true closure as it is now; None if that is not known, such as that of a real system.
         closure: the learned closure of the plant, as the likeliest hypothesis has it.
         initial_closure: the closure that the training started from.
         policies: both policies, by role.
@@ -29,8 +29,7 @@ class Snapshot:
         record: the last real episode, or its longest sound part.
         replay: states of the believed twin with the record's actions and exogenous input.
         segment: number of control intervals after which the replay begins anew in the record; 0 for never.
-        large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin, or the record
-            is a part of an episode.
+        large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin.
         realisations: samples of the exogenous process of the record; None as ``large_scale``.
         episodes: entries of the episodes, as in ``metrics.json``.
         simulated: words of a title for a record that is no episode of the training; empty for one that is.
@@ -38,7 +37,7 @@ class Snapshot:
     """
 
     plant: Plant
-    known: bool
+    true_closure: nn.Module | None
     closure: nn.Module
     initial_closure: nn.Module
     policies: dict[Role, nn.Module]
@@ -59,15 +58,11 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
-        n, flight = len(record.actions), algorithm.flights.latest
-        # An episode of which only a part is sound has no process; that of one that ended early goes on to the horizon.
-        whole = n == twin.plant.n_steps or (flight is not None and flight.ended)
-        fitted = algorithm.virtual.processes and whole
-        process = algorithm.virtual.processes[-1] if fitted else None
+        process = algorithm.virtual.paired([record])[1][0] if algorithm.virtual.processes else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
             plant=twin.plant,
-            known=algorithm.env.closure is not None,
+            true_closure=algorithm.env.closure,
             closure=twin.believed_law,
             initial_closure=initial_closure,
             policies=algorithm.policies,
@@ -75,7 +70,7 @@ class Snapshot:
             record=record,
             replay=twin.replayed(record, algorithm.assimilation.length),
             segment=algorithm.assimilation.length,
-            large_scale=None if process is None else process.mean[:n],
-            realisations=None if process is None else process.sample(5, generator)[:, :n],
+            large_scale=None if process is None else process.mean,
+            realisations=None if process is None else process.sample(5, generator),
             episodes=episodes,
         )

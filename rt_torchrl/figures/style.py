@@ -234,8 +234,9 @@ def array(tensor: Tensor) -> np.ndarray:
 
 
 def closures(snapshot: Snapshot) -> dict[str, nn.Module]:
-    """The closure of each line of ``CLOSURE_LINES``."""
-    return dict(zip(CLOSURE_LINES, (snapshot.plant.closure, snapshot.closure, snapshot.initial_closure), strict=True))
+    """The closure of each line of ``CLOSURE_LINES``; that of the plant stands for a true one that is not known."""
+    true = snapshot.plant.closure if snapshot.true_closure is None else snapshot.true_closure
+    return dict(zip(CLOSURE_LINES, (true, snapshot.closure, snapshot.initial_closure), strict=True))
 
 
 def last_episode(snapshot: Snapshot) -> int:

@@ -78,7 +78,7 @@ def states(snapshot: Snapshot) -> Figure:
             caption(ax, signal.label)
             continue
         ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
-        rms = np.sqrt(np.mean((twin[:, k] - real[:, k]) ** 2))
+        rms = np.sqrt(np.mean(signal.short_way(twin[:, k] - real[:, k]) ** 2))
         rms = 0.0 if rms <= 1e-10 * np.abs(real[:, k]).max() else rms
         caption(ax, signal.label, f"RMS {'diverges' if np.isnan(rms) else style.with_unit(rms, signal.unit)}")
     legend_below(figure, axes[:1])
@@ -159,8 +159,8 @@ def closure_weights(snapshot: Snapshot) -> Figure:
         snapshot: snapshot whose episodes report ``closure``, see :func:`tracked_weights`.
     """
     columns = tracked_weights(snapshot.episodes)
-    true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
-    true = true if snapshot.known else {}
+    laws = snapshot.true_closure, snapshot.initial_closure
+    true, start = ({} if law is None else _numbers(named_weights(law)) for law in laws)
     described = described_weights(snapshot.initial_closure)
     wide = min(3, len(columns))
     size = (0.6 + 3.6 * wide, 1.3 + 2.8 * -(-len(columns) // wide))
@@ -239,8 +239,8 @@ def policy_contours(snapshot: Snapshot) -> Figure:
 def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
     """Observations of the live policy in the last real episode."""
     plant, record = snapshot.plant, snapshot.record
-    t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
-    return plant.observe(t, record.states[:-1], record.exogenous)
+    clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
+    return plant.observe(record.start + plant.dt * clock, record.states[:-1], record.exogenous)
 
 
 def _curves(snapshot: Snapshot) -> Figure:

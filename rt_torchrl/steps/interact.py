@@ -142,8 +142,6 @@ class RealFlights:
         self._least = max(SHORTEST, LEAST_SOUND * plant.n_steps)
         self.faults: list[Fault] = []
         """Faults of the system since the episode of the algorithm began."""
-        self.latest: Flight | None = None
-        """The flight that was flown last."""
         self.check: Callable[[Trajectory], None] | None = None
         """What looks at the record of the first flight, before anything is learned from it, and may raise."""
 
@@ -177,11 +175,10 @@ class RealFlights:
         start = first * self.plant.dt
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
-        self.latest = Flight(transitions, record, parts, refused, faults, sound.whole, after)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
-        return self.latest
+        return Flight(transitions, record, parts, refused, faults, sound.whole, after)
 
     def fly_first(self, policy: nn.Module) -> Flight:
         """Fly one whole episode without exploration."""
