@@ -11,10 +11,11 @@ import sys
 import pytest
 import torch
 from figure_reading import draw
-from linear_quadratic import LinearClosure, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 from test_classical import PD
 from test_documentation import leave_finished_run
+from test_early_ends import Falling
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
 from test_predictive_control import Undisturbed
@@ -320,11 +321,16 @@ def test_figures_show_the_episode_that_is_given(run):
     assert {"states", "learning_curves", "power_and_speed"} <= set(run.figure_names())
 
 
-def test_a_twin_of_a_plant_without_inputs_was_trained_all_the_same(run, tmp_path):
-    plant = Undisturbed(horizon=2.0)
+@pytest.mark.parametrize("plant", [Undisturbed(horizon=2.0), Falling()])
+def test_figures_show_the_twin_of_a_plant_without_inputs_and_end_with_the_episode(run, plant, tmp_path):
     leave_run_of(tmp_path, RunConfig(log_dir=tmp_path), plant)
     shutil.copy(run.folder / "metrics.json", tmp_path)
-    assert "twin" in draw(load_run(tmp_path, plant=plant).figure("states"))
+    loaded = load_run(tmp_path, plant=plant)
+    flown = loaded.simulate(LinearGain([[0.0, 0.0]]))
+    ended = plant.ended(flown.states).tolist()
+    drawn = {line.get_label(): line.get_ydata() for line in loaded.figure("states", flown).axes[0].lines}
+    assert drawn.keys() >= {"real", "twin"}
+    assert len(drawn["real"]) == (ended.index(True) + 1 if any(ended) else plant.n_steps + 1)
 
 
 def test_figures_call_a_flight_on_the_twin_so(run):

@@ -15,7 +15,14 @@ from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, continued, control_cost, identification_cost
+from rt_torchrl.trajectories.trajectory import (
+    Trajectory,
+    batch_of,
+    continued,
+    control_cost,
+    identification_cost,
+    until_end,
+)
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:  # who draws unseen episodes of a plant needs no TorchRL
@@ -195,12 +202,9 @@ class UnseenEpisodes:
             measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
             return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
 
-        over = self.plant.ended(flown.states[:, 1:])
-        if not over.any():
+        if not self.plant.ended(flown.states).any():
             return means(flown)
-        lengths = torch.where(over.any(1), over.int().argmax(1) + 1, over.shape[1]).tolist()
-        parts = [episode.part(0, n, physics.dt) for episode, n in zip(flown.each(), lengths, strict=True)]
-        return torch.cat([means(batch_of([part])) for part in parts])
+        return torch.cat([means(batch_of([until_end(self.plant, flight)])) for flight in flown.each()])
 
 
 class TwinEpisodes(UnseenEpisodes):

@@ -23,7 +23,7 @@ from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, TwinFlight
+from rt_torchrl.trajectories.trajectory import Trajectory, TwinFlight, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:
@@ -190,13 +190,15 @@ class LoadedRun:
             flown = self.simulate(self.policy(live), seed=UNSEEN_SEED, on=place)
         on_the_twin, record = isinstance(flown, TwinFlight), flown
         record = record if record.states.dim() == 2 else record.each()[0]
+        inputs, record = record.exogenous, until_end(self.twin.believed.plant if on_the_twin else self.plant, record)
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
+        n = len(read.actions)
         segment = self.metrics["summary"]["twin"]["segment"]
         process, signals = None, self.physics.acting_inputs
         if self.config.twinning.arm != "model_free":
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
 
-            acted = read.exogenous[:, : len(signals)]
+            acted = inputs[:, : len(signals)]
             process = ExogenousProcess(
                 acted, dt=self.physics.dt, signals=signals, config=self.config.twinning.exogenous
             )
@@ -210,8 +212,8 @@ class LoadedRun:
             record=read,
             replay=self.twin.replayed(read, segment),
             segment=segment,
-            large_scale=None if process is None else process.mean,
-            realisations=None if process is None else process.sample(5, torch.Generator().manual_seed(0)),
+            large_scale=None if process is None else process.mean[:n],
+            realisations=None if process is None else process.sample(5, torch.Generator().manual_seed(0))[:, :n],
             episodes=self.metrics["episodes"],
             simulated="flight on the twin" if on_the_twin else "one flight",
             on_the_twin=on_the_twin,

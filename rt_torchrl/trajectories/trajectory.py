@@ -132,6 +132,12 @@ def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"
     return costs.mean(-1) + torch.where(ended, torch.zeros_like(last), last)
 
 
+def until_end(plant: Plant, flown: Trajectory) -> Trajectory:
+    """A trajectory without batch dimensions up to its early end, after which nothing moves whatever the actions are."""
+    over = plant.ended(flown.states[1:])
+    return flown.part(0, int(over.int().argmax()) + 1, plant.dt) if over.any() else flown
+
+
 def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"]:
     """Exogenous inputs of n intervals, of which a record that ended early holds the first ones.
 
