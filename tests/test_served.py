@@ -113,6 +113,8 @@ def test_a_client_answers_every_sample_of_the_plant():
     assert env.losses == env.stale == env.skipped == 0
     assert (found["next", "applied"] == 1.0).all()
     assert line.time.now == pytest.approx(5.0, rel=0.02)
+    line.time.now += 5.0  # between two episodes nobody reads
+    assert env.reset()["skipped"].item() == env.skipped == 0
     line.time.now += 0.35
     env.step(env.step_mdp(found[-1]).set("action", torch.ones(1).double()))
     assert env.pace.late > 0.2

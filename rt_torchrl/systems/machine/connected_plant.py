@@ -107,8 +107,8 @@ class ConnectedPlant(ForeignSystem):
     again, so that the pace is kept.
 
     The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
-    readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read. The attribute
-    ``reasons`` says for the tags of the last reading that are NaN, or for all of them, why they are.
+    readings of a plant that answered and had no new sample, and ``skipped`` all samples of episodes that nobody read.
+    The attribute ``reasons`` says for the tags of the last reading that are NaN, or for all of them, why they are.
 
     Args:
         link: connection to the plant.
@@ -176,6 +176,7 @@ class ConnectedPlant(ForeignSystem):
                 self.pace.begin()
                 reading = self._fresh() if self._connected else None
                 if reading is not None:
+                    self.skipped, self._gap = self.skipped - self._gap, 0  # no transition ends with the first reading
                     return self._entries(reading)
             except LinkLostError as lost:
                 self._connected, self._lost = False, str(lost)
