@@ -216,10 +216,19 @@ def require_finite(
 
 
 def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: Start = 0.0) -> Drive:
-    """The drive, time first, of inputs and commands with the batch first; :class:`Rollout` explains ``start``."""
+    """The drive, time first, of inputs and commands with the batch first; :class:`Rollout` explains ``start``.
+
+    Raises:
+        ValueError: if there is no interval, or inputs or commands are not in double precision.
+    """
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1)
+    if n < 1 or {exogenous.dtype, commands.dtype} != {torch.float64}:  # machine code would read beside them
+        raise ValueError(
+            f"exogenous of {n} intervals of plant {plant.name!r} is in {exogenous.dtype}, commands in "
+            f"{commands.dtype}; a trajectory needs at least one interval, and both in torch.float64."
+        )
     return Drive(t, exogenous.transpose(0, 1), commands)
 
 
