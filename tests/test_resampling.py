@@ -156,6 +156,16 @@ def test_samples_between_rows_that_are_too_far_apart_are_missing():
     assert record.guess.tolist() == [20.0, 11.0] and len(record.actions) == 29
 
 
+def test_no_sample_is_lost_by_the_rounding_of_unix_seconds():
+    plant = LinearQuadratic(dt=5e-4, horizon=0.5)
+    times = np.array([float(f"1700000000.{3700 + 5 * k}") for k in range(400)])
+    rare = np.where(np.arange(400) % 20 == 0, 1.0, np.nan)
+    log = checked(signals(times, position=rare), plant, missing=True)
+    parts = resample(filled(log, plant), plant)
+    record = logged_readings(log, plant, sensors_in(plant, log), parts.segments[0], parts.gap)
+    assert np.flatnonzero(record.seen[:, 0]).tolist() == list(range(0, 400, 20)) and len(record.actions) == 399
+
+
 REGULAR = signals(0.1 * np.arange(50))
 
 

@@ -267,6 +267,8 @@ def test_past_observations_follow_from_a_log():
     found = plant.complete_states(log, exogenous[0], commands[0])
     torch.testing.assert_close(found[1:], states[1:], rtol=1e-14, atol=1e-14)
     assert torch.equal(found[0, 2:], observed(plant, states[None], exogenous[:1])[0, 0, 2:])
+    before = plant.observe(torch.tensor(-1.0).double(), states[5], exogenous[0, 5])  # of a log that counts down to zero
+    assert torch.equal(before[2:], states[5, 2:])
 
 
 def test_a_real_system_that_reports_the_states_of_the_plant_alone():

@@ -34,7 +34,7 @@ INTERVALS_PER_ROW = 50
 DRAWS = 100
 """Number of initial states of a plant whose mean is the guess of a hidden one."""
 ROUNDING = 1e-6
-"""Share of an interval by which an instant may miss the grid."""
+"""Share of an interval by which an instant may miss the grid, beside the rounding of the instant itself."""
 
 
 class Resampled(NamedTuple):
@@ -72,7 +72,8 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
     cuts = np.union1d(np.flatnonzero(intervals > limit * (1.0 + ROUNDING)), left_out)
     ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
-    parts = [(k, last, int((log.times[last] - log.times[k]) / plant.dt + ROUNDING)) for k, last in ends]
+    slack = _slack(log.times, plant.dt)
+    parts = [(k, last, int((log.times[last] - log.times[k] + slack) / plant.dt)) for k, last in ends]
     too_short = [(float(log.times[first]), float(log.times[last])) for first, last, steps in parts if steps < shortest]
     enough = [part for part in parts if part[2] >= shortest]
     rows, steps = len(log.times), sum(steps for *_, steps in enough)
@@ -159,6 +160,11 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
     nearest = np.rint((times - times[0]) / plant.dt).astype(int)
     seen[torch.from_numpy(nearest[nearest <= steps])] = True
     return Trajectory(states, actions, exogenous, float(times[0]), None if seen.all() else seen)
+
+
+def _slack(times: Rows, dt: float) -> float:
+    """Time by which an instant may miss the grid; the seconds of Unix are rounded to a quarter of a microsecond."""
+    return ROUNDING * dt + 2.0 * float(np.spacing(np.abs(times).max()))
 
 
 def _unwrapped(signal: Signal, values: Rows) -> Rows:
@@ -279,7 +285,7 @@ def _samples(signal: Signal, times: Rows, values: Rows, grid: Samples, gap: floa
         return np.full(len(grid), np.nan)
     values = _unwrapped(signal, values)
     interpolated = np.interp(grid, times, values, left=np.nan, right=np.nan)
-    slack = ROUNDING * np.median(np.diff(grid))
+    slack = _slack(grid, np.median(np.diff(grid)))
     after = np.clip(np.searchsorted(times, grid - slack), 1, len(times) - 1)
     spacing = times[after] - times[after - 1]
     # A row at the instant itself needs no neighbour.

@@ -173,7 +173,7 @@ class StackedObservations(Extension):
         """The present observation and the past ones, the latest first."""
         base, past = self.split(state)
         now = self.base.observe(t, base, exogenous)
-        first = (t < 0.5 * self.dt).unsqueeze(-1)
+        first = (t.abs() < 0.5 * self.dt).unsqueeze(-1)
         return torch.cat([now, torch.where(first, torch.cat([now] * self.count, -1), past)], -1)
 
     def memorise(self, t: Time, state: State, exogenous: Input) -> State:
