@@ -70,13 +70,18 @@ def band(ax: Axes, curves: np.ndarray, colour: str, label: str) -> None:
     ax.plot(episodes, mean, color=colour, linestyle="--", label=label)
 
 
+def numbers(values: list[Any]) -> np.ndarray:
+    """An array of the numbers of ``metrics.json``, which holds null for those that are not finite."""
+    return np.array(values, dtype=float)
+
+
 def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
     """Figures 10 and 11: costs over the mean initial cost of the seeds, and which policy was live."""
-    start = np.mean([run["summary"]["unseen"]["J_a_before"]["mean"] for run in metrics])
-    start_of_twin = np.mean([run["episodes"][0]["J_p_before"] for run in metrics])
+    start = numbers([run["summary"]["unseen"]["J_a_before"]["mean"] for run in metrics]).mean()
+    start_of_twin = np.nanmean(numbers([run["episodes"][0]["J_p_before"] for run in metrics]))
 
     def curves(key: str, start: float = start) -> np.ndarray:
-        return np.array([[episode[key] for episode in run["episodes"]] for run in metrics]) / start
+        return numbers([[episode[key] for episode in run["episodes"]] for run in metrics]) / start
 
     figure, axes = panels(3, title=f"{plant}: learning, {len(metrics)} seeds", size=(7.5, 9.0), sharex=True)
     control, assimilation, live = axes.flat
@@ -164,7 +169,7 @@ def venting(run: rt.LoadedRun) -> Figure:
     flow = 1e3 * array(run.plant.vent(flown.states[:-1], flown.actions, law).flow)
     vented = array(run.plant.vented_mass(flown.states, flown.actions, law)[:-1])
     hours, pressure = run.plant.dt / 3600.0 * np.arange(len(flow)), 1e-3 * array(flown.states[:-1, 2])
-    arrived = hours[np.argmax(1e3 * pressure <= 1.005 * run.plant.set_point)]
+    arrived = min(hours[1e3 * pressure <= 1.005 * run.plant.set_point], default=np.nan)
     curves = (
         (hours, pressure, "pressure [kPa]", f"within 0.5 % after {arrived:.0f} h, paper {HOURS:g}"),
         (hours, vented, "vented mass [kg]", f"{np.interp(HOURS, hours, vented):.0f} in {HOURS:g} h, paper 87"),
@@ -187,7 +192,7 @@ def table(plant: str, metrics: list[dict[str, Any]]) -> str:
     lines = [f"{plant}, {len(metrics)} seeds: cost on unseen episodes after the training over the cost before"]
     keys = {"J_p": "J_p_ratio", **{role: f"J_a_ratio_{role}" for role in POLICIES}}
     for name, key in keys.items():
-        ratios, (mean, deviation) = np.array([run["summary"][key] for run in metrics]), RATIOS[plant][name]
+        ratios, (mean, deviation) = numbers([run["summary"][key] for run in metrics]), RATIOS[plant][name]
         text = f"{ratios.mean():.3g} ± {ratios.std(ddof=1):.3g}, median {np.median(ratios):.3g}"
         lines.append(f"  {name}: {text} (paper {mean:g} ± {deviation:g})")
     first = [next((k + 1 for k, e in enumerate(run["episodes"]) if e["event"] == "swap"), None) for run in metrics]
@@ -206,7 +211,7 @@ def main(config: Config) -> None:
     if failures := run_all(trainings, jobs=config.jobs):
         raise ValueError("\n".join(failures))
     metrics = [read_metrics(training.folder) | {"seed": training.seed} for training in trainings]
-    costs = [result["summary"]["unseen"][f"J_a_{result['summary']['live']}"]["mean"] for result in metrics]
+    costs = numbers([result["summary"]["unseen"][f"J_a_{result['summary']['live']}"]["mean"] for result in metrics])
     run = rt.load_run(trainings[int(np.argsort(costs)[len(costs) // 2])].folder)  # that of the median cost
     figures = {"learning": learning(config.plant, metrics), "robustness": robustness(config.plant, metrics)}
     figures["prediction"] = prediction(run)

@@ -8,6 +8,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
 from seeds_and_numbers import drawn
 from small_runs import SMALL
+from test_anchored import replays_on
 from test_classical import PD
 from test_learn import values
 from test_real_system import Rig, connected
@@ -33,6 +34,7 @@ from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig
 from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.interact import RealFlights
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.config import OperatingLimitsConfig
@@ -323,3 +325,17 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
     assert imitated and not any(plant.ended(observations).any() for observations in imitated)
     choice = found.steps["interact"].supervisor.choose("model_based", 5)
     assert choice.role == "first" and "would leave the limits" in choice.report["reason"]
+
+
+def test_the_anchored_replay_of_an_end_that_noise_hides_costs_what_the_episode_did():
+    """The last reading says that the rod has not fallen; the replay falls one interval later."""
+    plant, policy = Falling(), LinearGain(WEAK)
+    env, closure = PlantEnv(plant, seed=1), plant.make_closure(torch.Generator().manual_seed(0))
+    flight = RealFlights(env, actor_of(plant, policy), FlightCollector(env, actor_of(plant, policy)).rollout, plant)
+    flown = flight.fly(policy, strength=0.0, whole=True)
+    states = flown.record.states.clone()
+    states[-1, 0] = 0.99 * states[-1, 0].sign()
+    inputs = continued(flown.record.exogenous, plant.n_steps)[None]
+    replays = replays_on(plant, [flown.record._replace(states=states)], inputs, flown.cost[None], policy, closure)
+    alone = replays.twin.episode_costs(policy, states[:1], inputs)
+    torch.testing.assert_close(replays.corrections(policy), (flown.cost / alone).log(), rtol=0.0, atol=0.05)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.settings import module_of
 
@@ -49,6 +50,11 @@ def test_the_figures_of_the_paper_are_drawn_beside_its_numbers(plant, tmp_path, 
     assert f"{plant}, 2 seeds" in said and f"(paper {recipe.SWITCHES[plant]})" in said
     drawn = {path.stem for path in (tmp_path / plant / "figures").iterdir()}
     assert {"learning", "robustness", "prediction", *recipe.OF_A_RUN[plant], *recipe.OF_A_PLANT.get(plant, ())} <= drawn
+    # A twin that diverges leaves null in metrics.json, and the other numbers are drawn.
+    metrics = [read_metrics(tmp_path / plant / f"seed-{seed}") | {"seed": seed} for seed in (0, 1)]
+    metrics[0]["episodes"][0] |= {"J_p": None, "J_p_before": None}
+    metrics[0]["summary"]["J_p_ratio"] = None
+    assert "J_p: nan" in recipe.table(plant, metrics) and recipe.learning(plant, metrics)
 
 
 @pytest.mark.slow

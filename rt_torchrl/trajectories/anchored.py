@@ -28,7 +28,7 @@ from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.shapes import Action, Costs, Input, Inputs, Starts, State, Time
 from rt_torchrl.plants.signal import Signal, bounds, differences
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, whole_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 OBSERVATIONS = 64
@@ -98,10 +98,9 @@ class AnchoredReplays:
             ends, r = believed.followed(record), record.states.shape[-1]
             missed = differences(twin.plant.readings, record.states[1:], ends[1:, :r])
             increments.append(torch.cat([missed, missed.new_zeros(n - len(missed), r)]))
-            rest = n - len(record.actions)  # the state in which it ended early
-            full = torch.cat([record.states, ends[:, r:]], -1)
-            states, actions = (torch.cat([x, x[-1:].expand(rest, -1)]) for x in (full, record.actions))
-            counted.append(control_cost(believed.plant, Trajectory(states[None], actions[None], exogenous[None])))
+            full = torch.cat([record.states, ends[:, r:]], -1)[None]
+            flight = Trajectory(full, record.actions[None], exogenous[None, : len(missed)])
+            counted.append(whole_cost(believed.plant, flight, n))
         self.inputs, self.anchored = inputs, torch.cat([inputs, torch.stack(increments)], -1)
         self.offsets: Costs = _log_ratio(costs, torch.cat(counted))
         self._seen = list[tuple[State, Tensor, Action]]()

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rt_torchrl.plants.plant import Plant, flight_costs
+from rt_torchrl.plants.plant import Plant, final_cost, flight_costs
 
 
 class Scenario(NamedTuple):
@@ -136,6 +136,16 @@ def until_end(plant: Plant, flown: Trajectory) -> Trajectory:
     """A trajectory without batch dimensions up to its early end, after which nothing moves whatever the actions are."""
     over = plant.ended(flown.states[1:])
     return flown.part(0, int(over.int().argmax()) + 1, plant.dt) if over.any() else flown
+
+
+def whole_cost(plant: Plant, flight: Trajectory, n: int) -> Float[Tensor, " batch"]:
+    """J_a of whole episodes of n intervals; with fewer they have ended, even if readings with noise do not show it."""
+    flown = flight.actions.shape[-2]
+    cost = control_cost(plant, flight)
+    if flown < n:
+        last = final_cost(plant, flight.states[..., -1, :]) / (flown * plant.dt)
+        cost = (flown * (cost - last) + (n - flown) * (plant.end_cost or 0.0)) / n
+    return cost
 
 
 def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"]:
