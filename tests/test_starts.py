@@ -5,6 +5,7 @@ import json
 
 import pytest
 import small_runs
+import test_early_ends
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
@@ -212,15 +213,17 @@ class Ending(LinearQuadratic):
         return 0.5 * state[..., 0] ** 2
 
 
-def test_transitions_of_a_record_are_those_of_a_flight():
-    """Its end costs what the end of an episode does; a part of it has no such end."""
-    plant = Ending(horizon=2.0)
+@pytest.mark.parametrize("plant", [Ending(horizon=2.0), test_early_ends.Falling()])
+def test_transitions_of_a_record_are_those_of_a_flight(plant):
+    """Its end, at the horizon or early, is that of an episode; a part of it has no such end."""
     env = PlantEnv(plant, seed=0)
     episode = env.rollout(plant.n_steps)[0]
     states = torch.cat([episode["state"], episode["next", "state"][-1:]])
     record = Trajectory(states, episode["next", "applied"], episode["exogenous"])
     found = transitions_of(plant, record)
-    for key in ("observation", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated")):
+    assert (len(episode) < plant.n_steps) == bool(episode["next", "terminated"].any()) == (plant.end_cost is not None)
+    ends = [("next", key) for key in ("observation", "reward", "done", "terminated", "truncated")]
+    for key in ("observation", *ends):
         torch.testing.assert_close(found[key], episode[key], rtol=1e-13, atol=1e-13)
     part, rewards = transitions_of(plant, record.part(0, 10, plant.dt)), episode["next", "reward"][:10]
     torch.testing.assert_close(part["next", "reward"], rewards, rtol=1e-13, atol=1e-13)

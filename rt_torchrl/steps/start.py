@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, final_cost
 from rt_torchrl.steps.config import Arm, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.interact import Flight
@@ -162,9 +162,10 @@ class RecordedFlights:
 
 
 def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
-    """The transitions of a record, as a learner stores those of a real episode; the last one is truncated.
+    """The transitions of a record, as a learner stores those of a real episode.
 
-    The last one pays the terminal cost if the record is as long as an episode.
+    The last one is truncated, unless the episode ends there early, and pays the terminal cost if the record is as long
+    as an episode.
     """
     states, actions, inputs, start, _ = record
     n = len(actions)
@@ -173,11 +174,12 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     observation = plant.observe(t, states, torch.cat([inputs, inputs[-1:]]))
     reward = -plant.running_cost(t[:-1], states[:-1], actions, inputs)
     if n == plant.n_steps:
-        reward = torch.cat([reward[:-1], reward[-1:] - plant.terminal_cost(states[-1:]) / plant.dt])
+        reward = torch.cat([reward[:-1], reward[-1:] - final_cost(plant, states[-1:]) / plant.dt])
     never: Tensor = torch.zeros(n, 1, dtype=torch.bool, device=states.device)
-    truncated = never.clone()
-    truncated[-1] = True
-    ended = {"reward": reward.unsqueeze(-1), "done": truncated, "truncated": truncated.clone(), "terminated": never}
+    done = never.clone()
+    done[-1] = True
+    over = done & plant.ended(states[1:]).unsqueeze(-1)
+    ended = {"reward": reward.unsqueeze(-1), "done": done, "truncated": done & ~over, "terminated": over}
     flags = {key: never.clone() for key in ("done", "truncated", "terminated")}
     return TensorDict(
         {
