@@ -9,6 +9,7 @@ from seeds_and_numbers import drawn
 from tensordict import TensorDict
 
 from rt_torchrl import DigitalTwin, ExtendedClosure, PlantEnv, ReinforcementTwinning, TwinningConfig
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, twin_entries
@@ -16,6 +17,7 @@ from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (
     EnsembleAssimilation,
+    Fit,
     Reread,
     counting,
     evidence,
@@ -155,6 +157,18 @@ def test_an_episode_reports_the_twin_that_is_believed():
     entries = twin_entries(twin)
     assert entries["believed"] == "lags" and entries["closure"] == named_weights(lagged.closure.base)
     assert entries["closure"] != named_weights(twin.closure)
+
+
+def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
+    """The hypothesis that is right replays any segments exactly, in a training, its figures and on unseen episodes."""
+    real = LaggedActuator(PLANT, "force", LAG)
+    (record, states), twin = recorded(real), DigitalTwin(real, real.closure)
+    fit, unseen = Fit(twin, ASSIMILATION, 2), UnseenEpisodes(real, 2)
+    for fit.whole.length in (0, 7, 25):
+        assert fit.cost([record]) < 1e-20 and max(fit.whole.rms_errors(fit.rested([record])).values()) < 1e-10
+        torch.testing.assert_close(twin.replayed(record, fit.whole.length), record.states)
+        flown = batch_of([record._replace(states=states)])
+        assert unseen.identification_costs(real, real.closure, flown, fit.whole.length).item() < 1e-20
 
 
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():

@@ -184,11 +184,11 @@ class UnseenEpisodes:
             segment: number of control intervals of the segments over which J_p is the mean, as in step 4; 0 for whole
                 episodes.
         """
-        rollout = Rollout(physics, closure)
+        twin, read = DigitalTwin(physics, closure), len(self.plant.readings)
 
         def costs(batch: Trajectory) -> Costs:
             try:
-                replayed = rollout(batch.states[:, 0], batch.exogenous, batch.actions, start=batch.start)
+                replayed = twin.replay(batch.states[:, 0], batch.exogenous, batch.actions, start=batch.start)
             except DivergenceError:
                 if len(batch.states) == 1:
                     return batch.states.new_full((1,), torch.inf)
@@ -198,9 +198,10 @@ class UnseenEpisodes:
 
         def means(flown: Trajectory) -> Costs:
             episodes, n = flown.actions.shape[:2]
+            measured = flown._replace(states=flown.states[..., :read])
+            flown = batch_of([twin.completed(episode) for episode in measured.each()])
             flown = flown.segments(min(segment, n), physics.dt) if segment else flown
-            measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
-            return costs(flown._replace(states=measured)).unflatten(0, (episodes, -1)).mean(1)
+            return costs(flown).unflatten(0, (episodes, -1)).mean(1)
 
         if not self.plant.ended(flown.states).any():
             return means(flown)

@@ -91,15 +91,27 @@ class DigitalTwin:
                 an unstable twin leaves longer records; 0 for the whole record.
         """
         believed, n = self.believed, len(record.actions)
+        starts = believed.completed(record).states
         states = torch.full_like(record.states, math.nan)
         states[0] = record.states[0]
         for first in range(0, n, segment or n):
             part = record.part(first, min(first + (segment or n), n), self.plant.dt)
-            begins = believed.plant.at_rest(part.states[:1])
             with contextlib.suppress(DivergenceError):
+                begins = starts[first : first + 1]
                 flown = believed.replay(begins, part.exogenous[None], part.actions[None], start=part.start)
                 states[first + 1 : first + len(part.states)] = flown.states[0, 1:, : states.shape[-1]]
         return states
+
+    def completed(self, record: Trajectory) -> Trajectory:
+        """The record with the states that no sensor reads, as :meth:`followed` finds them, or at rest if they diverge.
+
+        Segments of the record then begin with those that the twin has by then.
+        """
+        states, read = self.plant.at_rest(record.states), record.states.shape[-1]
+        with contextlib.suppress(DivergenceError):
+            if self.plant.unread:
+                states = torch.cat([record.states, self.followed(record)[:, read:]], -1)
+        return record._replace(states=states)
 
     @torch.no_grad()
     def followed(self, record: Trajectory) -> Float[Tensor, "samples n_s"]:

@@ -207,18 +207,15 @@ class Fit:
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         if self._held and math.isfinite(least):  # see HELD
             self.short.prior.stiffness = self.whole.prior.stiffness = HELD * least
-        stages_by_name = {
-            "short": (self.short, [reread(record, plant, self.segment) for record in records]),
-            "whole": (self.whole, self.rested(records)),
-        }
+        read_again = [reread(record, plant, self.segment) for record in records]
         arrived = False
         for name in stages:
             safe_point()
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
-                stage, stage_records = stages_by_name[name]
-                steps = stage.update(stage_records, (), 1, generator).iterations
+                stage, replayed = (self.short, read_again) if name == "short" else (self.whole, self.rested(records))
+                steps = stage.update(replayed, (), 1, generator).iterations
             present = misfit(self.twin, records, self.segment)
             if present < least:
                 least, best = present, copy.deepcopy(closure.state_dict())
@@ -235,8 +232,11 @@ class Fit:
         return self.whole.cost_of(self.whole.in_segments(batch_of(self.rested(records))))
 
     def rested(self, records: Sequence[Trajectory]) -> list[Trajectory]:
-        """The records with the hidden states of the hypothesis at rest, of which a replay takes those of the start."""
-        return [record._replace(states=self.twin.plant.at_rest(record.states)) for record in records]
+        """The records with the hidden states of the hypothesis, of which a replay takes those at the start of segments.
+
+        They are at rest at the start of a record.
+        """
+        return [self.twin.completed(record) for record in records]
 
     def state_dict(self) -> dict[str, Any]:
         closures = {"closure": self.twin.closure.state_dict(), "first": self._first}
