@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import multiprocessing
 import os
 
@@ -102,10 +103,10 @@ class Constant(torch.nn.Module):
         return self.values.expand(*observation.shape[:-1], -1)
 
 
-def handed_over(plant, before, after, at):
+def handed_over(plant, before, after, at, env=None):
     """The commands of a window in which one constant policy takes over from another one."""
     policies = {"before": before, "after": after}
-    found = InProcess(plant, policies, QUIET, PlantEnv(plant))
+    found = InProcess(plant, policies, QUIET, env or PlantEnv(plant))
     found.hand_over("before", before, strength=0.0)
     intervals = itertools.count()
     found.receive = lambda: found.hand_over("after", after, strength=0.0) if next(intervals) == at else None
@@ -152,6 +153,11 @@ def machine(injections=(), fallback=(0.0,), **options):
 def operated(env, *, continuous=False, **options):
     make = lambda *parts: InProcess(*parts, env, continuous=continuous)  # noqa: E731
     return twinning(make, PLANT, **options)
+
+
+def test_a_policy_that_asks_for_no_number_leaves_nothing_to_the_next():
+    window = handed_over(PLANT, Constant(math.nan), Constant(0.5), 10, env=machine())
+    assert window["next", "applied"].flatten().tolist() == [0.0] * 10 + [0.5] * 20
 
 
 @pytest.mark.parametrize("continuous", [False, True])

@@ -188,7 +188,9 @@ class BumplessPolicy(LivePolicy):
         if self._former is not None:
             before = super().commanded(self._former, observation, state, exogenous)
             before = before if self._offset is None else before + self._offset
-            self._former, self._offset = None, before.clamp(self.low, self.high) - command
+            offset = before.clamp(self.low, self.high) - command
+            # A policy that asked for no number leaves nothing behind.
+            self._former, self._offset = None, offset.nan_to_num(0.0, 0.0, 0.0)
         return command if self._offset is None else command + self._offset
 
     def _faded(self, offset: Tensor, state: Tensor) -> Tensor | None:
