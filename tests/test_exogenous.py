@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
+from small_plants import flown
 
 from rt_torchrl import DigitalTwin, ExogenousConfig, Signal
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.steps.inputs import ExogenousProcess, VirtualEpisodes, mixed
+from rt_torchrl.steps.inputs import ExogenousProcess, VirtualEpisodes, mixed, set_points
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5
@@ -157,3 +159,21 @@ def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():
     episodes, generator = virtual.draw(200), seeded()
     assert torch.equal(episodes.initial_state, plant.draw_initial_state(200, generator))
     assert torch.equal(episodes.exogenous, plant.draw_exogenous(200, generator))
+
+
+class SetPoint(LinearQuadratic):
+    """The disturbance is a set point, another one in each episode."""
+
+    def draw_exogenous(self, batch, generator):
+        return torch.randn(batch, 1, 1, generator=generator, dtype=torch.float64).expand(-1, self.n_steps, 1)
+
+
+def test_set_points_are_drawn_by_the_plant_although_one_was_met():
+    plant = SetPoint(horizon=2.0)
+    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), ExogenousConfig(), 3, generator=seeded())
+    (record,) = flown(plant, seeded(), (plant.n_steps,))
+    virtual.learn(record)
+    drawn = virtual.draw(50).exogenous
+    assert torch.equal(drawn, drawn[:, :1].expand_as(drawn)) and drawn.std() > 0.5
+    assert torch.allclose(virtual.draw(3, recorded=True).exogenous, record.exogenous.expand(3, -1, -1))
+    assert not set_points(LinearQuadratic(horizon=2.0), torch.device("cpu")).any()

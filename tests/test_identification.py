@@ -151,6 +151,19 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
     assert estimation(None).run(calm).segment == 0
 
 
+@pytest.mark.parametrize(("angle", "unstable"), [(0.0, True), (np.pi, False)])
+def test_instability_is_sought_where_the_record_is_and_not_where_a_replay_comes_to_rest(angle, unstable):
+    """Held upright with noise; replays with much friction fall, and hang like those of a record that hangs."""
+    plant, noise = DoublePendulum(), 0.01 * torch.randn(201, 4, generator=torch.Generator().manual_seed(0)).double()
+    states = noise + torch.tensor([angle, angle, 0.0, 0.0])
+    record = Trajectory(states, torch.zeros(200, 1).double(), torch.zeros(200, 0).double())
+    sensors = sensors_of(plant, [state.name for state in plant.states])
+    twin = DigitalTwin(plant, Joints(torch.tensor([0.5, 1.0, 2.0, 2.0])))
+    fallen = twin.replay(states[:1], record.exogenous[None], record.actions[None]).states[0, -1]
+    assert (fallen[:2].cos() < -0.9).all()
+    assert Estimation(twin, sensors).unstable([sensor_record(plant, sensors, record)]) is unstable
+
+
 def test_of_segments_that_are_followed_alike_the_longest_stay():
     """Over thirds the errors are not small enough, but less than three times those over ninths."""
     errors, closure = {0: 10.0, 2: 0.5, 30: 1.2, 10: 0.6}, LinearClosure(torch.zeros(2, 2))

@@ -203,6 +203,20 @@ def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for
     assert "the live policy costs" not in capsys.readouterr().out
 
 
+def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
+    rig = machine()
+
+    def destabilise(episodes):
+        with torch.no_grad():
+            for policy in run.algorithm.policies.values():
+                policy.gain.fill_(-2.0)
+
+    run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, callbacks=[destabilise])
+    flown = run.train()["summary"]["real_unseen"]["controllers"]
+    assert [*flown] == ["PD"] and len(rig.flights) == 3 + 2
+    assert "does not fly the real system: model_" in capsys.readouterr().out
+
+
 def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
     rig = machine()
     run_on(rig, tmp_path, real_unseen=2).train()

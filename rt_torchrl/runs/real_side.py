@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Baseline, Judged, TwinEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
@@ -129,29 +129,21 @@ def end_operation(algorithm: ReinforcementTwinning) -> None:
         algorithm.operating.operation.close()
 
 
-def contenders(
-    config: RunConfig,
-    algorithm: ReinforcementTwinning,
-    untrained: Mapping[Role, nn.Module],
-    baselines: Mapping[str, Baseline],
-) -> dict[str, nn.Module]:
-    """The controllers that are to fly the real system after the training, by name.
+def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Mapping[Role, nn.Module]) -> str:
+    """Why the live policy does not fly the real system after the training; empty if it does.
 
-    These are the live policy, unless it still has the random weights that it began with, and the controllers that are
-    judged beside the policies.
+    It does not where it still has the random weights that it began with, and where it may not act.
 
     Args:
         config: options of the run.
         algorithm: the training at its end.
         untrained: the policies before it.
-        baselines: controllers that are judged beside the policies, with the one that the training has begun with.
     """
-    if not config.real_unseen:
-        return {}
-    live = algorithm.referee.live
+    live, supervisor = algorithm.referee.live, algorithm.steps["interact"].supervisor
     policy = algorithm.policies[live]
-    known = config.start != "random" or isinstance(policy, StateFeedback) or not clones(policy, untrained[live])
-    return ({live: policy} if known else {}) | dict(baselines)
+    if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
+        return f"{live} has its random initial weights"
+    return supervisor.refusal(live, supervisor.episodes(config.twinning.virtual_episodes))[0]
 
 
 def announcement(names: Iterable[str], live: Role, count: int) -> str:

@@ -299,11 +299,13 @@ class Run:
         Before the first flight the run says how many of whom. Who has pressed Ctrl-C does not want the system to go on.
         """
         config, live = self.config, self.algorithm.referee.live
-        if self._real is None or (len(self.episodes) < config.episodes and self.ended is None):
+        interrupted = len(self.episodes) < config.episodes and self.ended is None
+        if self._real is None or not config.real_unseen or interrupted:
             return None
-        laws = real_side.contenders(config, self.algorithm, self.initial_policies, self.baselines)
-        if config.real_unseen and live not in laws:
-            bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
+        reason = real_side.grounded(config, self.algorithm, self.initial_policies)
+        if reason:
+            bar.write(f"the live policy does not fly the real system: {reason}")
+        laws = ({} if reason else {live: self.algorithm.policies[live]}) | self.baselines
         if before := real_side.judged_before(self.folder, len(self.episodes), laws, config.real_unseen):
             bar.write("the real system has been flown after these episodes; it is not flown again")
             return before

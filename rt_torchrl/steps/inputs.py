@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -236,6 +236,8 @@ EXTREMES = 1000
 policy does in one of hundreds."""
 EXTREMES_SEED = 3_000_000
 """Seed of the initial states among which the extreme ones are found: the same for every training."""
+DRAWN = 8
+"""Number of episodes whose inputs tell which of them are constant."""
 RARE, FAILURE = 0.01, 10.0
 """Share of all episodes that begin like the extreme ones, and how many times the usual cost they may cost there."""
 
@@ -254,6 +256,21 @@ def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tens
     drawn = plant.draw_initial_state(max(count, 1), torch.Generator(device=device).manual_seed(EXTREMES_SEED))
     varied = drawn[:, (drawn != drawn[0]).any(0)]
     return drawn[torch.cat([varied.argmin(0), varied.argmax(0)]).unique()]
+
+
+def set_points(plant: Plant, device: torch.device) -> Bool[Tensor, " n_z"]:
+    """Which inputs that act the plant draws constant over an episode, and anew for another one.
+
+    A few episodes hold few values of such an input, as of a set point or a load. A policy that is planned on these
+    alone may fail at all others.
+
+    Args:
+        plant: the plant, which draws the inputs.
+        device: device of the inputs.
+    """
+    generator = torch.Generator(device=device).manual_seed(EXTREMES_SEED)
+    drawn = plant.draw_exogenous(DRAWN, generator)[..., : len(plant.acting_inputs)]
+    return (drawn == drawn[:, :1]).all(1).all(0) & (drawn[:, 0] != drawn[0, 0]).any(0)
 
 
 class VirtualEpisodes:
@@ -281,6 +298,7 @@ class VirtualEpisodes:
         self.recorded: Tensor | None = None
         """Initial state of the last whole real episode."""
         self.extremes = extreme_states(twin.plant, extremes, generator.device)
+        self.set_points = set_points(twin.plant, generator.device)
 
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state.
@@ -329,7 +347,7 @@ class VirtualEpisodes:
         Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
         states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
-        one wind of twenty.
+        one wind of twenty. Inputs like set points are always as the plant draws them, see :func:`set_points`.
 
         Args:
             count: number of virtual episodes.
@@ -344,6 +362,9 @@ class VirtualEpisodes:
         if large_scale == "drawn":
             return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
         exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
+        if self.set_points.any() and not recorded:
+            drawn = plant.draw_exogenous(count, self.generator)[..., : exogenous.shape[-1]]
+            exogenous = torch.where(self.set_points, drawn, exogenous)
         return Scenario(initial_state, plant.with_previews(exogenous))
 
     @torch.no_grad()

@@ -166,19 +166,25 @@ class RealFlights:
             first, last = sound.longest
             if episode is not None and (sound.whole or (not whole and last - first >= self._least)):
                 break
+            if self.check is not None and episode is not None and last > first and episode["next", "terminated"].any():
+                self.check(self._record(episode, (first, last)))  # a wrong sign ends an episode at once
             refused.append(sound.reason)
             if len(refused) == FLIGHTS:
                 raise ValueError(tried_in_vain(refused)) from cause
         parts = [_transitions(episode, part) for part in sound.parts]
-        transitions = parts[sound.parts.index((first, last))]
-        states = torch.cat([transitions["state"], transitions["next", "state"][-1:]])
-        start = first * self.plant.dt
-        record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
+        transitions, record = parts[sound.parts.index((first, last))], self._record(episode, (first, last))
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
         return Flight(transitions, record, parts, refused, faults, sound.whole, after)
+
+    def _record(self, episode: TensorDictBase, part: tuple[int, int]) -> Trajectory:
+        """The trajectory of a part of an episode, with the actions that were applied."""
+        first, last = part
+        flown = episode[first:last]
+        states = torch.cat([flown["state"], flown["next", "state"][-1:]])
+        return Trajectory(states, flown["next", "applied"], flown["exogenous"], first * self.plant.dt)
 
     def fly_first(self, policy: nn.Module) -> Flight:
         """Fly one whole episode without exploration."""
@@ -272,20 +278,12 @@ class Supervisor:
         Raises:
             ValueError: if nothing may act.
         """
-        episodes = self.virtual.draw(count) if self.limited and self.virtual.processes else None
-        refused = list[str]()
+        episodes, refused = self.episodes(count), list[str]()
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
-            share = 0.0 if episodes is None else self.predicted(policy, episodes)
-            known = self.belief.beside_first(policy, self.controller) if share == 0.0 else None
-            if share > 0.0:
-                refused.append(f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals")
-            elif known is not None and known[0] > TWICE * known[1]:
-                expected, paid = map(in_words, known)
-                refused.append(
-                    f"{role} may not act: it is expected to cost {expected} where the controller that flew first cost "
-                    f"{paid}"
-                )
+            reason, share = self.refusal(role, episodes)
+            if reason:
+                refused.append(reason)
             elif episodes is None:
                 return Choice(policy, role, metrics(*refused))
             else:
@@ -302,6 +300,29 @@ class Supervisor:
             f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, such "
             "as --start controller."
         )
+
+    def episodes(self, count: int) -> Scenario | None:
+        """Virtual episodes in which the limits are checked; None without limits, and before anything is known."""
+        return self.virtual.draw(count) if self.limited and self.virtual.processes else None
+
+    @torch.no_grad()
+    def refusal(self, role: Role, episodes: Scenario | None) -> tuple[str, float]:
+        """Why a policy may not act, empty if it may, and the share of control intervals beyond a limit.
+
+        Args:
+            role: role of the policy.
+            episodes: see :meth:`episodes`.
+        """
+        policy = self.policies[role]
+        share = 0.0 if episodes is None else self.predicted(policy, episodes)
+        if share > 0.0:
+            return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
+        known = self.belief.beside_first(policy, self.controller)
+        if known is None or known[0] <= TWICE * known[1]:
+            return "", share
+        expected, paid = map(in_words, known)
+        where = f"where the controller that flew first cost {paid}"
+        return f"{role} may not act: it is expected to cost {expected} {where}", share
 
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
         """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
