@@ -56,7 +56,7 @@ class BiasedSensor(Extension):
     Args:
         base: the plant.
         state: name of the state that is read.
-        offset: b_0 of the true system, in the unit of the state.
+        offset: b_0 of the true system, in the unit of the state; 0 for a suspect, which begins there anyway.
         drift: ḃ of the true system, in the unit of the state per second.
         scale: size of an offset that changes what the policy does, in the unit of the state; it scales the weights.
 

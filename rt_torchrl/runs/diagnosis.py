@@ -109,6 +109,8 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes,
     What is best on some episodes is not so on others: weights are sought on validation episodes.
     """
     name, remedy = "the plan is in a poor minimum", "more twinning.planner.starts or iterations, or another --seed"
+    if run.physics.end_cost is not None:
+        remedy += ", and a running cost that rises steeply before episodes end early"
     role, policy = run.live, run.policy(run.live)
     if isinstance(policy, StateFeedback):
         return costs, Reason(name, None, f"{type(policy).__name__} has no weights that are planned", remedy)
@@ -130,10 +132,10 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, b
 
     One that is worse says nothing: it may lack plans, such as for the tank's half-open valve, or a forecast.
     """
-    name = "the class of policies is too small"
-    remedy = "further observations, --policy mlp with more hidden units, or model predictive control (--preset mpc)"
+    name, remedy = "the class of policies is too small", "further observations, --policy mlp with more hidden units"
     if run.physics.end_cost is not None:
         return Reason(name, None, "model predictive control does not consider that an episode may end early", remedy)
+    remedy = f"{remedy}, or model predictive control (--preset mpc)"
     window = run.config.twinning.planner.receding_horizon
     controller = PredictiveControl(unseen.plant, unseen.known_closure(), window)
     controller.learn(validation.exogenous)
@@ -146,7 +148,7 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, b
 def _inputs(run: LoadedRun, costs: Costs) -> Reason:
     """Whether episodes that no training has drawn cost more on the twin than those that plans were made on."""
     name = "unseen inputs differ from those that plans were made on"
-    remedy = "records of other conditions, or twinning.exogenous as the inputs really scatter"
+    remedy = "records of other conditions, or --twinning.exogenous.large-scale mixed, or drawn for set points"
     entries = run.metrics["episodes"]
     planned = [entry["J_a_plan"] for entry in entries if entry.get("J_a_plan") is not None]
     if not planned:
