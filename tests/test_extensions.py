@@ -285,6 +285,13 @@ def test_a_plant_says_which_methods_it_must_define():
         Half(dt=0.1, horizon=1.0, closure=nn.Identity())
 
 
+@pytest.mark.parametrize("further", [((), {"bias": True}), ((True,), {})])
+def test_an_argument_of_the_plant_alone_is_refused(further):
+    arguments, named = further
+    with pytest.raises(TypeError, match="make_policy of LaggedActuator takes generator"):
+        EXTENSIONS["lag"](LinearQuadratic()).make_policy(seeded(), *arguments, **named)
+
+
 def test_hidden_states_need_a_start():
     class Startless(Extension):
         pass

@@ -213,6 +213,11 @@ def _delegated(part: str, method: str) -> Callable[..., Any]:
 
     def answer(extension: Extension, *arguments: Any, **named: Any) -> Any:
         values = dict(zip(names, arguments, strict=False)) | named
+        if values.keys() != {*names} or len(arguments) > len(names):
+            raise TypeError(
+                f"{method} of {type(extension).__name__} takes {', '.join(names)}; ask the plant, of class "
+                f"{type(extension.innermost).__name__}, for what else it takes."
+            )
         return extension.ask(part, method, {name: values[name] for name in names})
 
     return answer
