@@ -217,6 +217,18 @@ def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_p
     assert "does not fly the real system: model_" in capsys.readouterr().out
 
 
+def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_training(tmp_path, capsys):
+    rig = machine()
+
+    def fail(episodes):
+        rig.ends_after, rig.terminates = (5, True) if len(episodes) == 2 else (None, False)
+
+    metrics = run_on(rig, tmp_path, real_unseen=2, baselines={"PD": PD}, callbacks=[fail]).train()
+    assert len(metrics["episodes"]) == 2 and "real_unseen" not in metrics["summary"]
+    said = capsys.readouterr().out
+    assert "PD is not judged on the real system: the environment terminated the episode after 5 of 20" in said
+
+
 def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
     rig = machine()
     run_on(rig, tmp_path, real_unseen=2).train()

@@ -315,7 +315,14 @@ class Run:
         bar.doing("judging on the real system")
         episodes = RealEpisodes(self._real, config.real_unseen, device=self._device)
         episodes.bounds = self.unseen.bounds
-        flights = {name: episodes.fly(law) for name, law in laws.items()}
+        flights = dict[str, Trajectory]()
+        for name, law in laws.items():
+            try:
+                flights[name] = episodes.fly(law)
+            except ValueError as error:  # the system has ended an episode; the results of the training stay
+                bar.write(f"{name} is not judged on the real system: {error}")
+        if not flights:
+            return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
         self._paid += [cost for judgement in judged.values() for cost in judgement.control_costs.tolist()]
         entry = real_side.entries(flights, judged, live)
