@@ -194,6 +194,7 @@ SWAPPED, TURN = [1, 0, 2, 3, 4, 5], 180.0 / math.pi
 MISTAKES = {
     "torque has the other sign": (PENDULUM, {"sent": (-1.0, 0.0)}, "action torque has the other sign"),
     "degrees for radians": (PENDULUM, {"scale": only(PENDULUM, 0, TURN)}, "angle is in deg, where"),
+    "all in degrees": (PENDULUM, {"scale": TURN}, "all states in rad and rad/s are in deg and deg/s"),
     "torque one interval late": (PENDULUM, {"late": True}, "an action acts one interval late"),
     "torque does not arrive": (PENDULUM, {"stays": [0.5]}, "action torque does not arrive"),
     "speeds in the other order": (TURBINE, {"order": SWAPPED}, "rotor_speed and filtered_generator_speed are in the"),
@@ -224,7 +225,7 @@ MISTAKES = {
 }
 
 
-QUICK = ("torque has the other sign", "degrees for radians", "torque one interval late", "°C for K")
+QUICK = ("torque has the other sign", "degrees for radians", "all in degrees", "torque one interval late", "°C for K")
 QUICK += tuple(name for name, (plant, *_) in MISTAKES.items() if plant in (ARM, LEVELS, REVERSED))
 
 
