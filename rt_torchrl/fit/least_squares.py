@@ -113,9 +113,9 @@ def over_segments(
 
     Where the errors over whole records are not small enough, short segments are fitted from the same weights, and whole
     records again from what these tell; the better of the two fits of whole records stays. If the twin is stable under
-    that, it lacks something that no segment shows better, and whole records stay. Otherwise segments of a third of the
-    records are fitted, then of a ninth, and so on, from the same weights or, where the twin diverges over whole records
-    under these, from what the short ones tell.
+    what short segments tell, it lacks something that no segment shows better, and whole records stay. Otherwise
+    segments of a third of the records are fitted, then of a ninth, and so on, from the same weights or, where the twin
+    diverges over whole records under these, from what the short ones tell.
 
     Args:
         closure: closure with the weights; those of the fit that is returned stay.
@@ -149,9 +149,10 @@ def over_segments(
         explains(short, start)
         probed = fits.pop(short, None)
         if probed is not None:
-            closure.load_state_dict(probed[2])
-            stable = not unstable()  # before whole records bend the weights until nothing grows
-            whole = explains(0, probed[2]) or (0 in fits and stable)
+            whole = explains(0, probed[2])
+            if not whole and 0 in fits:
+                closure.load_state_dict(probed[2])  # whole records bend the weights until nothing grows
+                whole = not unstable()
             if first is None or not first[1].isfinite().all():
                 start = probed[2]
         if first is not None and (0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough)):

@@ -234,8 +234,8 @@ def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "s
 EXTREMES = 1000
 """Number of random initial states among which the extreme ones are found: twenty virtual episodes do not show what a
 policy does in one of hundreds."""
-EXTREMES_SEED = 3_000_000
-"""Seed of the initial states among which the extreme ones are found: the same for every training."""
+DRAWS_SEED = 3_000_000
+"""Seed of the draws that tell the extreme states and the set points of a plant: the same for every training."""
 DRAWN = 8
 """Number of episodes whose inputs tell which of them are constant."""
 RARE, FAILURE = 0.01, 10.0
@@ -253,7 +253,7 @@ def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tens
         count: number of random initial states; 0 for no extremes.
         device: device of the states.
     """
-    drawn = plant.draw_initial_state(max(count, 1), torch.Generator(device=device).manual_seed(EXTREMES_SEED))
+    drawn = plant.draw_initial_state(max(count, 1), torch.Generator(device=device).manual_seed(DRAWS_SEED))
     varied = drawn[:, (drawn != drawn[0]).any(0)]
     return drawn[torch.cat([varied.argmin(0), varied.argmax(0)]).unique()]
 
@@ -268,7 +268,7 @@ def set_points(plant: Plant, device: torch.device) -> Bool[Tensor, " n_z"]:
         plant: the plant, which draws the inputs.
         device: device of the inputs.
     """
-    generator = torch.Generator(device=device).manual_seed(EXTREMES_SEED)
+    generator = torch.Generator(device=device).manual_seed(DRAWS_SEED)
     drawn = plant.draw_exogenous(DRAWN, generator)[..., : len(plant.acting_inputs)]
     return (drawn == drawn[:, :1]).all(1).all(0) & (drawn[:, 0] != drawn[0, 0]).any(0)
 

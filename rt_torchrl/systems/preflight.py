@@ -445,7 +445,8 @@ def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
     yield from _signal_mistakes("state", states, flown, ("states", "ends"), FACTORS, [s.unit for s in states])
     yield from _signal_mistakes("action", actions, flown, ("actions",), (), [""] * len(actions))
     yield from _signal_mistakes("input", inputs, flown, ("exogenous",), FACTORS, [s.name for s in inputs])
-    for unit, other, scale in (("rad", "deg", math.pi / 180.0), ("deg", "rad", 180.0 / math.pi)):
+    for unit in ("rad", "deg"):
+        (other, scale, _), *_ = OTHER_UNITS[unit]
         columns = [k for k, signal in enumerate(states) if signal.unit in (unit, f"{unit}/s")]
         if len({states[k].unit for k in columns}) == 2:
             turned = _changed(flown, ("states", "ends"), columns, scale, 0.0)
