@@ -5,23 +5,18 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
-from rt_torchrl.optimisers.levenberg_marquardt import place
-from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.optimisers.simplex import FEW, by_simplex
 
 SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
 """Adam's options, beside β₂ = 0.99, of the two halves of an approach."""
 TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
 FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
 """Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
-DIRECT = 20
-"""Greatest number of weights that are also searched without gradients."""
 FOR_FEW_WEIGHTS = {"approach": 0, "iterations": 80, "polish": 20}
 """Numbers of gradients of a policy with no more weights."""
 ENOUGH, POLISH = 80, 20
@@ -72,58 +67,27 @@ def exact_optimum(
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
+    def cost_of(policy: nn.Module, count: int | None = None) -> Callable[[], Tensor]:
+        rollout, state, exogenous = unseen.rollout(policy), unseen.initial_state[:count], unseen.exogenous[:count]
+        return lambda: rollout.costs(state, exogenous).mean()
+
     def descend(policy: nn.Module, count: int, steps: int, *, approaching: int = 0) -> float:
-        rollout = unseen.rollout(policy)
-        state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
-
-        def cost() -> Tensor:
-            return rollout.costs(state, exogenous).mean()
-
+        cost = cost_of(policy, count)
         for config in SMALL_STEPS if approaching else ():
             Descent(policy, config, second_moment=0.99).run(cost, approaching // 2)
         return Descent(policy, TO_THE_END).run(cost, steps).best
 
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
     count = sum(weight.numel() for weight in policies[0].parameters() if weight.requires_grad)
-    usual = FOR_PERCEPTRONS if count > DIRECT else FOR_FEW_WEIGHTS
+    usual = FOR_PERCEPTRONS if count > FEW else FOR_FEW_WEIGHTS
     requested = {"approach": approach, "iterations": iterations, "polish": polish}
     effort = {name: usual[name] if number is None else number for name, number in requested.items()}
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     best, *others = (policies[k] for k in sorted(range(starts), key=costs.__getitem__))
     by_gradients = descend(best, len(unseen.initial_state), effort["polish"])
     candidates = [(by_gradients, best)]
-    if 0 < count <= DIRECT:
+    if 0 < count <= FEW:
         for policy in (copy.deepcopy(best), *others[:1]):
-            by_simplex(unseen.first(few), policy, count * ENOUGH, size=0.3)
-            candidates.append((by_simplex(unseen, policy, count * POLISH, size=0.05), policy))
+            by_simplex(policy, cost_of(policy, few), count * ENOUGH, size=0.3)
+            candidates.append((by_simplex(policy, cost_of(policy), count * POLISH, size=0.05), policy))
     return Optimum(*min(candidates, key=lambda pair: pair[0]), costs, by_gradients)
-
-
-def by_simplex(unseen: UnseenEpisodes, policy: nn.Module, count: int, *, size: float) -> float:
-    """Search the weights of a policy without gradients; it gets the best ones.
-
-    Args:
-        unseen: the episodes, whose mean J_a is searched.
-        policy: the policy.
-        count: greatest number of costs.
-        size: size of the first simplex, as a share of each weight.
-    """
-    from scipy.optimize import minimize  # here, because the options of a recipe need not wait for it
-
-    weights = [weight for weight in policy.parameters() if weight.requires_grad]
-    start = parameters_to_vector(weights).detach()
-    scale, rollout = size * start.abs().clamp_min(0.1), unseen.rollout(policy)
-
-    @torch.no_grad()
-    def cost(shares: np.ndarray) -> float:
-        place(start + scale * torch.as_tensor(shares, device=start.device), weights)
-        try:
-            value = rollout.costs(unseen.initial_state, unseen.exogenous).mean().item()
-        except DivergenceError:
-            return math.inf
-        return value if math.isfinite(value) else math.inf
-
-    simplex = np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
-    options = {"maxfev": count, "initial_simplex": simplex, "adaptive": True, "xatol": 1e-6, "fatol": 1e-12}
-    minimum = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
-    return cost(minimum.x)

@@ -98,17 +98,6 @@ class UnseenEpisodes:
         """The plant that the flights are of."""
         return self.plant
 
-    def first(self, count: int) -> "UnseenEpisodes":
-        """The first of these episodes, on the system as it is now.
-
-        Args:
-            count: number of episodes, at least 2; all of them if there are fewer.
-        """
-        episodes = copy.copy(self)
-        episodes.initial_state, episodes.exogenous = self.initial_state[:count], self.exogenous[:count]
-        return episodes
-
-    @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy or a classical controller.
 

@@ -6,7 +6,9 @@ the better the nearer the policy is to the one that flew: its error has the vari
 
 .. math:: s_i^2 = \sigma^2 + n_iv\,\|\pi - \pi_i\|^2, \qquad n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
 
-with the mean square of the difference of actions, in shares of half their ranges. What other inputs change, σ, is
+with the mean square of the difference of actions, in shares of half their ranges. A c_i below that of every flight, and
+below zero, counts as the lowest of these: where a closed loop falls on the twin alone, its replay with what the twin did
+not explain may chance to hold it. What other inputs change, σ, is
 independent in each episode; what the distance hides is the same for all n_i episodes that policies like this one flew.
 The corrections are averaged,
 
@@ -96,11 +98,19 @@ class Judged(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The anchored replays of the latest real episodes, and the variance σ² of their corrections with its growth v."""
+    """What the latest real episodes say of other policies.
+
+    Attributes:
+        replays: the anchored replays.
+        noise: variance σ² of their corrections.
+        growth: its growth v with the distance.
+        least: least correction that counts, the lowest of what flew, or zero.
+    """
 
     replays: AnchoredReplays
     noise: float
     growth: float
+    least: float
 
 
 class Belief:
@@ -303,7 +313,8 @@ class Belief:
         distances = (replays.actions(policy) - replays.flown).square().sum(-1) + replays.explored
         alike = torch.exp(-0.5 * replays.distances() / LENGTH**2).sum(-1)
         precisions = 1.0 / (anchors.noise + anchors.growth * alike * distances)
-        return ((precisions * replays.corrections(policy)).sum() + 0.5) / precisions.sum()
+        corrections = replays.corrections(policy).clamp_min(anchors.least)
+        return ((precisions * corrections).sum() + 0.5) / precisions.sum()
 
     @property
     def contradicted(self) -> bool:
@@ -345,7 +356,8 @@ class Belief:
             torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),
             lambda k: self.policy_of(whole[k]),
         )
-        return Anchors(replays, *self._variances(replays.latest(ANCHORS), whole[-ANCHORS:], differences[-ANCHORS:]))
+        variances = self._variances(replays.latest(ANCHORS), whole[-ANCHORS:], differences[-ANCHORS:])
+        return Anchors(replays, *variances, min(0.0, *differences))
 
     def _variances(
         self, replays: AnchoredReplays, flown: Sequence[Flown], differences: Sequence[float]

@@ -65,8 +65,6 @@ class ExogenousProcess:
         if not record.isfinite().all():
             k = (~record.isfinite().all(-1)).nonzero()[0].item()
             raise ValueError(f"record of the exogenous input is not finite at sample {k}, t = {k * dt:g} s; repair it.")
-        if len(record) < 8:
-            raise ValueError(f"record has {len(record)} samples; at least 8 are needed to separate its scales.")
         config = config or ExogenousConfig()
         like = partial(torch.as_tensor, dtype=record.dtype, device=record.device)
         self._low, self._high = bounds(signals, dtype=record.dtype, device=record.device)

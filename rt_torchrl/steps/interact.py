@@ -166,8 +166,6 @@ class RealFlights:
             first, last = sound.longest
             if episode is not None and (sound.whole or (not whole and last - first >= self._least)):
                 break
-            if self.check is not None and episode is not None and last > first and episode["next", "terminated"].any():
-                self.check(self._record(episode, (first, last)))  # a wrong sign ends an episode at once
             refused.append(sound.reason)
             if len(refused) == FLIGHTS:
                 raise ValueError(tried_in_vain(refused)) from cause

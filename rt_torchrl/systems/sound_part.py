@@ -102,18 +102,7 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     starts = [k for k, good in enumerate(sound) if good and (k == 0 or not sound[k - 1])]
     ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == n or not sound[k + 1])]
     over = plant.end_cost is not None and bool(episode["next", "terminated"][-1].any())
-    if over and n < SHORTEST:
-        # An episode that is over at once shows less than a fault leaves.
-        state = ", ".join(
-            f"{signal.name} = {value:.4g} {signal.unit}"
-            for signal, value in zip(plant.readings, episode["next", "state"][-1].tolist(), strict=False)
-        )
-        reasons.append(
-            f"plant {plant.name!r} ended it (ended) after {n} of {plant.n_steps} control intervals, at {state}; "
-            f"{SHORTEST} are needed at least: begin with a controller that lasts (--start controller), explore less "
-            "(--twinning.exploration.spread), or take a smaller dt"
-        )
-    whole = (n == plant.n_steps or (over and n >= SHORTEST)) and all(sound)
+    whole = (n == plant.n_steps or over) and all(sound)
     parts = list(zip(starts, ends, strict=True))
     return SoundPart(parts, _reported(report) + overflows, "; ".join(reasons), whole)
 
