@@ -241,8 +241,6 @@ class ReinforcementTwinning(TensorDictSequential):
         if on_twin:
             self.steps["assimilate"].fit(records)
             self.assimilation.explain(self.belief.replayed(records), self.generator)
-            if "model_based" in pupils:
-                self.steps["plan"].planning.remember()
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)
         report = imitation.begin(self.first.teacher, imitating, flown, on_twin=on_twin)

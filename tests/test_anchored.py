@@ -212,6 +212,19 @@ def test_corrections_are_averaged_and_those_of_like_policies_count_once():
     assert belief.expected(policy, 2.0) == pytest.approx(2.0 * math.exp(mean + 0.5 * variance))
 
 
+def test_no_correction_says_that_a_policy_is_cheaper_than_any_flight_was(monkeypatch):
+    """A closed loop that falls on the twin, and not in an anchored replay, would be the cheapest of all."""
+    real, physics = pushed()
+    belief, policy = belief_of(real, physics, [(0.5, 0.5), (1.5, 0.4)]), LinearGain([[1.0, 0.5]])
+    anchors, cheapest = belief.anchors(), min(0.0, *belief.differences())
+    monkeypatch.setattr(anchors.replays, "latest", lambda count: anchors.replays)
+    monkeypatch.setattr(anchors.replays, "corrections", lambda policy: torch.tensor([-4.0, -5.0]).double())
+    spread = (anchors.noise + anchors.growth * 4.0) ** 0.5  # actions differ by at most twice half their ranges
+    assert cheapest <= belief.correction(policy).item() < cheapest + 0.5 * spread**2
+    monkeypatch.setattr(anchors.replays, "corrections", lambda policy: torch.tensor([4.0, 4.0]).double())
+    assert belief.correction(policy).item() >= 4.0
+
+
 class Told:
     """Replays whose corrections are known of each policy, a multiple of ten of which says how far it is from others."""
 

@@ -1,7 +1,6 @@
 """The best policy of a class on the true plant."""
 
 import copy
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,6 +1,5 @@
 """Evaluation of twin and policies on episodes that no training has drawn: on the plant, the twin or a real system."""
 
-import copy
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, NamedTuple
 

@@ -6,11 +6,10 @@ the better the nearer the policy is to the one that flew: its error has the vari
 
 .. math:: s_i^2 = \sigma^2 + n_iv\,\|\pi - \pi_i\|^2, \qquad n_i = \sum_j e^{-\|\pi_i - \pi_j\|^2/2\ell^2}
 
-with the mean square of the difference of actions, in shares of half their ranges. A c_i below that of every flight, and
-below zero, counts as the lowest of these: where a closed loop falls on the twin alone, its replay with what the twin did
-not explain may chance to hold it. What other inputs change, σ, is
-independent in each episode; what the distance hides is the same for all n_i episodes that policies like this one flew.
-The corrections are averaged,
+with the mean square of the difference of actions, in shares of half their ranges. What other inputs change, σ, is
+independent in each episode; what the distance hides is the same for all n_i episodes that policies like this one
+flew. A c_i below zero and below that of every flight counts as the lowest of these: where a closed loop falls on the
+twin, its replay with what the twin did not explain may chance not to. The corrections are averaged,
 
 .. math:: m = s^2\sum_ic_i/s_i^2, \qquad s^{-2} = \sum_is_i^{-2}
 

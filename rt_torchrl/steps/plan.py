@@ -201,12 +201,11 @@ class Plan(NamedTuple):
 class MultiStart:
     """Plans from several starts on some virtual episodes, and judges the plans on others; the best one stays.
 
-    A descent begins with the present weights. It begins with others, too, in the episodes 1, 2 and 4, and where
-    gradients explode in the first plan that gains nothing or is refused, the second, the fourth and so on: with those
-    before the imitation of a controller, with the best of some random policies, and with those of the last that have
-    flown and are expected to cost least. Where real episodes contradict the twin, a descent begins with these in every
-    episode in which they are expected to cost less than the present ones, and they stay as they are if they are
-    expected to cost less than every plan.
+    A descent begins with the present weights. In the episodes 1, 2 and 4, and where gradients explode in the first plan
+    that gains nothing or is refused, the second, the fourth and so on, it also begins with the best of some random
+    policies, and with those weights of the last that have flown that are expected to cost least. Where real episodes
+    contradict the twin, a descent begins with the latter in every episode in which they are expected to cost less than
+    the present ones, and they stay as they are if they are expected to cost less than every plan.
 
     Note: the paper keeps every plan, as ``single_start`` does. Here a plan made on N_z winds is compared with the
     previous policy on N other winds, because the best policy for a few winds can lie just beyond a cliff of another
@@ -239,7 +238,6 @@ class MultiStart:
         """Whether plans are compared; else every one is kept."""
         self.count = config.starts if config.method == "multi_start" and not fed_back else 0
         self.make_policy = make_policy or self.virtual.twin.plant.make_policy
-        self._first: Weights | None = None
         self._stalled = 0
         device = self.virtual.generator.device
         drawn = self.make_policy(torch.Generator(device=device)) if self.count else planner.policy
@@ -249,11 +247,6 @@ class MultiStart:
                 f"make_policy draws a {type(drawn).__name__}, and model_based is another "
                 f"{type(planner.policy).__name__}; let it draw random policies like that one, or use starts=0."
             )
-
-    def remember(self) -> None:
-        """Plan from the present weights, too, whenever plans have several starts; state feedback has none."""
-        if self.count:
-            self._first = copy.deepcopy(self.planner.policy.state_dict())
 
     def plan(self, episode: int, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
         """Plan; the policy gets the weights that are expected to cost least.
@@ -277,7 +270,7 @@ class MultiStart:
         whole = isinstance(self.planner, WholeEpisodes)
         corrected = whole and self.belief.corrects and self.belief.contradicted
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
-        recalled = [(3, flown[0])] if flown is not None and corrected and flown[1] < before else []
+        recalled = [(2, flown[0])] if flown is not None and corrected and flown[1] < before else []
         if several or recalled:
             others = self._others(episode, planned_on, flown) if several else recalled
             new = ((number, weights) for number, weights in others if not equal(weights, present))
@@ -357,12 +350,10 @@ class MultiStart:
         self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None
     ) -> Iterator[tuple[int, Weights]]:
         """Other weights to begin with, and the number by which ``start`` reports their kind."""
-        if self._first is not None:
-            yield 2, self._first
         if self.alike:
             yield 1, self._random(episode, planned_on)
         if flown is not None:
-            yield 3, flown[0]
+            yield 2, flown[0]
 
     @torch.no_grad()
     def _random(self, episode: int, planned_on: Scenario) -> Weights:
@@ -384,12 +375,12 @@ class MultiStart:
         return best[1]
 
     def state_dict(self) -> dict[str, Any]:
-        """The weights that later plans begin with, and for how many plans gradients have exploded."""
-        return {"first": self._first, "stalled": self._stalled}
+        """For how many plans gradients have exploded."""
+        return {"stalled": self._stalled}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of another one with the same planner."""
-        self._first, self._stalled = state["first"], state["stalled"]
+        self._stalled = state["stalled"]
 
 
 def planned(plan: Descended) -> TensorDict:
