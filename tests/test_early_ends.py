@@ -41,7 +41,14 @@ from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, continued, control_cost, identification_cost
+from rt_torchrl.trajectories.trajectory import (
+    Scenario,
+    Trajectory,
+    batch_of,
+    continued,
+    control_cost,
+    identification_cost,
+)
 
 
 class Falling(LinearQuadratic):

@@ -1,6 +1,5 @@
 """Step 5: plans from several starts, judged on other episodes."""
 
-import copy
 import math
 
 import pytest
