@@ -87,7 +87,9 @@ ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
 def test_weights_are_shown_with_what_is_known_of_them(known, errors, columns, rows):
     closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "described": {}} | known
     shown = [" ".join(line.split()) for line in closure_lines(closure, errors=errors)]
-    assert shown == [f"closure weight start found{columns}", *rows]
+    legend = "std. error -: the records say nothing of the weight alone, at most of combinations with others"
+    unknown = errors is not None and None in errors.values()
+    assert shown == [f"closure weight start found{columns}", *rows, *[legend][: int(unknown)]]
 
 
 # The bar of a training says what is under way.

@@ -384,6 +384,8 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | Non
         label = f"{name} [{description['unit']}]" if description["unit"] else name
         cells = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
         lines.append(f"  {label:<22}{cells}   {description['meaning']}".rstrip())
+    if any(error is None or math.isinf(error) for name, error in (errors or {}).items() if name in weights):
+        lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
     return lines
 
 
