@@ -1,6 +1,5 @@
 """Reinforcement twinning of gym-electric-motor's series DC motor, whose speed is to follow a reference."""
 
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -126,9 +125,6 @@ def real_system(plant: Drive, *, seed: int = 0):
 
 
 # A reference is known beforehand, and one of them says nothing of the next one.
-TWINNING = replace(rt.FEW_COEFFICIENTS, exogenous=rt.ExogenousConfig(large_scale="drawn"))
-
-
 @rt.configuration
 class Config(rt.RunConfig):
     """Let the speed of gym-electric-motor's series DC motor follow a reference.
@@ -142,7 +138,7 @@ class Config(rt.RunConfig):
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"
-    twinning: rt.TwinningConfig = TWINNING
+    twinning: rt.TwinningConfig = rt.FEW_COEFFICIENTS
 
     def plant(self) -> Drive:
         return Drive()

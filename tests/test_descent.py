@@ -44,6 +44,13 @@ def test_adam_reaches_the_minimum():
     assert found.gradient == pytest.approx(math.sqrt(1 + 64 + 25), rel=1e-14)
 
 
+def test_weights_beyond_single_precision_are_not_kept():
+    """The cost falls until the weights are 1e40, which neither dashboards nor exported controllers can hold."""
+    point = Point()
+    found = Descent(point, DescentConfig(rate=1e39)).run(lambda: (1.0 - 1e-40 * point.at.sum()).square(), 3)
+    assert found.best == found.start == 1.0 and not point.at.any()
+
+
 @pytest.mark.parametrize("iterations", [3, 100])
 def test_lbfgs_evaluates_nothing_beside_its_gradients(iterations):
     """Its line search has evaluated where it ends; Adam has not evaluated its last step."""

@@ -248,7 +248,9 @@ class _Trials:
                 self._note(self._cost().item())
 
     def _note(self, cost: float) -> None:
-        if cost < self.best or math.isnan(self.best):
+        # Weights that are not finite in single precision are of no use to anybody.
+        lower = cost < self.best and all(weight.float().isfinite().all() for weight in self._weights)
+        if lower or math.isnan(self.best):
             self.best, self.best_weights = cost, copy.deepcopy(self._module.state_dict())
         if cost < self._stop_below:
             raise _Finished

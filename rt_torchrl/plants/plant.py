@@ -89,7 +89,7 @@ class Plant(nn.Module):
     observation_sets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """Names of measurements that are observed together, by the name of the set."""
     controller_states: tuple[str, ...] = ()
-    """Names of the states that a controller computes, such as filters, integrals and the actions applied last.
+    """Names of the states that a controller computes, as in ``("integral",)``: filters, integrals, the last actions.
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
@@ -264,9 +264,16 @@ class Plant(nn.Module):
     def discrepancy_scales(self) -> tuple[float, ...]:
         """Differences c_i of the states that count alike in L_p, in their units; infinite for one not compared.
 
-        By default these are :attr:`state_sizes`; a plant may override them.
+        By default these are :attr:`state_sizes`, and infinite for :attr:`controller_states`, which say no more than the
+        measured states that they follow from; a plant may override them.
         """
-        return self.state_sizes or (1.0,) * len(self.states)
+        names = [signal.name for signal in self.states]
+        sizes = self.state_sizes or (1.0,) * len(names)
+        if len(sizes) != len(names):  # which :meth:`discrepancy` refuses
+            return sizes
+        return tuple(
+            math.inf if name in self.controller_states else size for name, size in zip(names, sizes, strict=True)
+        )
 
     def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
         r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`.
@@ -281,7 +288,7 @@ class Plant(nn.Module):
         scales = self.discrepancy_scales
         if len(scales) != len(self.states) or not all(scale > 0.0 for scale in scales):
             named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
-            argument = "state_sizes" if scales is self.state_sizes else "discrepancy_scales"
+            argument = "state_sizes" if scales == self.state_sizes else "discrepancy_scales"
             raise ValueError(f"{argument}={scales} of plant {self.name!r} must have one positive number each: {named}.")
         compared = [k for k, scale in enumerate(scales) if scale < math.inf]
         signals = [self.states[k] for k in compared]

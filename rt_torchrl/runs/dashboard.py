@@ -20,6 +20,10 @@ GROUPS = {
 """Groups of curves, with what the names of their entries in ``metrics.json`` begin with; others are of the steps."""
 
 
+BINS = "sturges"
+"""Rule for the bins of a histogram; TensorBoard's own ones end at 1e20, and refuse what lies beyond."""
+
+
 class Dashboard:
     """A dashboard, which writes TensorBoard events.
 
@@ -47,7 +51,7 @@ class Dashboard:
         histograms = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
         for name, costs in histograms.items():
             if None not in costs:  # which stands for a cost that is not finite
-                self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(costs), 0)
+                self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(costs), 0, bins=BINS)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
@@ -68,7 +72,7 @@ class Dashboard:
         for role, policy in policies.items():
             weights |= {f"{role}/{name}": weight.detach().cpu() for name, weight in policy.named_parameters()}
         for name, values in weights.items():
-            self._writer.add_histogram(name, np.ravel(values), step)
+            self._writer.add_histogram(name, np.ravel(values), step, bins=BINS)
 
     def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""

@@ -148,7 +148,7 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, b
 def _inputs(run: LoadedRun, costs: Costs) -> Reason:
     """Whether episodes that no training has drawn cost more on the twin than those that plans were made on."""
     name = "unseen inputs differ from those that plans were made on"
-    remedy = "records of other conditions, or --twinning.exogenous.large-scale mixed, or drawn for set points"
+    remedy = "records of other conditions, or --twinning.exogenous.large-scale mixed or drawn"
     entries = run.metrics["episodes"]
     planned = [entry["J_a_plan"] for entry in entries if entry.get("J_a_plan") is not None]
     if not planned:

@@ -204,7 +204,7 @@ def require_simulation(
         ValueError: if there is such an option or controller; it names it.
     """
     if env is not None and (config.noise or config.wear(plant) is not None):
-        raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
+        raise ValueError(f"noise={config.noise}, or wear, needs a plant in simulation; this run has a real system.")
     if env is None and config.real_unseen:
         raise ValueError(
             f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "

@@ -247,6 +247,8 @@ class Belief:
         if warning is None:
             return report
         explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
+        if self.virtual.twin.plant.end_cost is not None:
+            explained += "; or the policy is so near an early end that small errors decide"
         return report.set_non_tensor("warning", warning + explained)
 
     @property

@@ -235,7 +235,7 @@ policy does in one of hundreds."""
 DRAWS_SEED = 3_000_000
 """Seed of the draws that tell the extreme states and the set points of a plant: the same for every training."""
 DRAWN = 8
-"""Number of episodes whose inputs tell which of them are constant."""
+"""Number of episodes, and of moments in each, whose inputs tell on which of them no equation depends."""
 RARE, FAILURE = 0.01, 10.0
 """Share of all episodes that begin like the extreme ones, and how many times the usual cost they may cost there."""
 
@@ -256,19 +256,37 @@ def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tens
     return drawn[torch.cat([varied.argmin(0), varied.argmax(0)]).unique()]
 
 
-def set_points(plant: Plant, device: torch.device) -> Bool[Tensor, " n_z"]:
-    """Which inputs that act the plant draws constant over an episode, and anew for another one.
+@torch.no_grad()
+def set_points(twin: DigitalTwin, device: torch.device) -> Bool[Tensor, " n_z"]:
+    """Which inputs that act are set points: no equation of the plant depends on them, only costs and observations.
 
-    A few episodes hold few values of such an input, as of a set point or a load. A policy that is planned on these
-    alone may fail at all others.
+    Who sets them knows how they will be set, which a few episodes do not show. A policy that is planned on the few that
+    were met may fail at all others. An equation depends on an input if an interval ends elsewhere with another one, at
+    some states near the initial ones and some actions.
 
     Args:
-        plant: the plant, which draws the inputs.
+        twin: the twin, whose plant draws states and inputs.
         device: device of the inputs.
     """
-    generator = torch.Generator(device=device).manual_seed(DRAWS_SEED)
-    drawn = plant.draw_exogenous(DRAWN, generator)[..., : len(plant.acting_inputs)]
-    return (drawn == drawn[:, :1]).all(1).all(0) & (drawn[:, 0] != drawn[0, 0]).any(0)
+    plant, generator = twin.plant, torch.Generator(device=device).manual_seed(DRAWS_SEED)
+    drawn = plant.draw_exogenous(DRAWN, generator)
+    moments = torch.linspace(0, plant.n_steps - 1, DRAWN, device=device).long()
+    inputs, t = drawn[:, moments].flatten(0, 1), plant.dt * moments.double().repeat(DRAWN)
+    like = partial(torch.randn, generator=generator, dtype=torch.float64, device=device)
+    sizes = torch.tensor(plant.state_sizes or [1.0] * len(plant.states), dtype=torch.float64, device=device)
+    states = plant.draw_initial_state(len(inputs), generator) + sizes * like(len(inputs), len(plant.states))
+    low, high = (bound.nan_to_num(posinf=1.0, neginf=-1.0) for bound in bounds(plant.actions, device=device))
+    actions = low + (high - low) * like(len(inputs), len(plant.actions)).sigmoid()
+
+    def ends(inputs: Tensor) -> Tensor:
+        return torch.cat(plant.step(t, states, actions, inputs, twin.closure), -1).nan_to_num()
+
+    usual, free = ends(inputs), []
+    for k in range(len(plant.acting_inputs)):
+        others = inputs.clone()
+        others[:, k] = inputs[:, k].roll(DRAWN) + 0.01 * (1.0 + inputs[:, k].abs())
+        free.append(torch.equal(ends(others), usual))
+    return torch.tensor(free, dtype=torch.bool, device=device)
 
 
 class VirtualEpisodes:
@@ -296,7 +314,7 @@ class VirtualEpisodes:
         self.recorded: Tensor | None = None
         """Initial state of the last whole real episode."""
         self.extremes = extreme_states(twin.plant, extremes, generator.device)
-        self.set_points = set_points(twin.plant, generator.device)
+        self.set_points = set_points(twin, generator.device)
 
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it and the initial state.
@@ -345,7 +363,7 @@ class VirtualEpisodes:
         Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
         states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
-        one wind of twenty. Inputs like set points are always as the plant draws them, see :func:`set_points`.
+        one wind of twenty. Set points are always as the plant draws them, see :func:`set_points`.
 
         Args:
             count: number of virtual episodes.
@@ -357,10 +375,11 @@ class VirtualEpisodes:
             initial_state = self.recorded.repeat(count, 1)
         else:
             initial_state = plant.draw_initial_state(count, self.generator)
-        if large_scale == "drawn":
+        set_points = self.set_points.any() and not recorded
+        if large_scale == "drawn" or (set_points and self.set_points.all()):
             return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
         exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
-        if self.set_points.any() and not recorded:
+        if set_points:
             drawn = plant.draw_exogenous(count, self.generator)[..., : exogenous.shape[-1]]
             exogenous = torch.where(self.set_points, drawn, exogenous)
         return Scenario(initial_state, plant.with_previews(exogenous))
