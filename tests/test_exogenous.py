@@ -163,7 +163,7 @@ def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():
 
 
 class SetPoint(LinearQuadratic):
-    """A wandering set point, on which the cost depends alone, beside a disturbance that acts on a speed, if it moves."""
+    """A wandering set point, on which only the cost depends, and a disturbance that acts on what moves."""
 
     inputs = (*LinearQuadratic.inputs, dataclasses.replace(LinearQuadratic.inputs[0], name="set_point"))
 
