@@ -124,7 +124,6 @@ def real_system(plant: Drive, *, seed: int = 0):
     )
 
 
-# A reference is known beforehand, and one of them says nothing of the next one.
 @rt.configuration
 class Config(rt.RunConfig):
     """Let the speed of gym-electric-motor's series DC motor follow a reference.

@@ -181,6 +181,23 @@ class SetPoint(LinearQuadratic):
         return 1.0 + steps.cumsum(1) / self.n_steps**0.5
 
 
+class Integrating(SetPoint):
+    """The first state is an integral that the controller computes from the set point."""
+
+    controller_states = (SetPoint.states[0].name,)
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        disturbance, set_point = exogenous.unbind(-1)
+        return torch.stack([set_point - state[..., 0], disturbance * state[..., 1]], -1)
+
+
+def test_an_integral_of_the_controller_is_no_equation_of_the_plant():
+    plant = Integrating(horizon=2.0)
+    assert set_points(DigitalTwin(plant, plant.closure), torch.device("cpu")).tolist() == [False, True]
+    plant.controller_states = ()
+    assert not set_points(DigitalTwin(plant, plant.closure), torch.device("cpu")).any()
+
+
 def test_set_points_are_drawn_by_the_plant_although_some_were_met():
     plant = SetPoint(horizon=2.0)
     twin = DigitalTwin(plant, plant.closure)
@@ -190,4 +207,5 @@ def test_set_points_are_drawn_by_the_plant_although_some_were_met():
     virtual.learn(record)
     spread = (virtual.draw(200).exogenous[:, -1] - record.exogenous[-1]).std(0)
     assert spread[1] > 0.8 > 0.5 > spread[0]
+    assert ((virtual.draw(200, recorded=True).exogenous[:, -1] - record.exogenous[-1]).std(0) < 0.5).all()
     assert not set_points(DigitalTwin(LinearQuadratic(), LinearQuadratic().closure), torch.device("cpu")).any()

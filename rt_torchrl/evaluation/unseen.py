@@ -97,6 +97,7 @@ class UnseenEpisodes:
         """The plant that the flights are of."""
         return self.plant
 
+    @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy or a classical controller.
 

@@ -288,7 +288,9 @@ class Plant(nn.Module):
         scales = self.discrepancy_scales
         if len(scales) != len(self.states) or not all(scale > 0.0 for scale in scales):
             named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
-            argument = "state_sizes" if scales == self.state_sizes else "discrepancy_scales"
+            argument = (
+                "state_sizes" if type(self).discrepancy_scales is Plant.discrepancy_scales else "discrepancy_scales"
+            )
             raise ValueError(f"{argument}={scales} of plant {self.name!r} must have one positive number each: {named}.")
         compared = [k for k, scale in enumerate(scales) if scale < math.inf]
         signals = [self.states[k] for k in compared]

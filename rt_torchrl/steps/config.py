@@ -71,11 +71,11 @@ class ExogenousConfig:
             large scale.
         penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
         tube: half-width ε of the regression's tube, in standard deviations of the record.
-        large_scale: large scale of the disturbances that steps 5 and 6 draw; set points, on which no equation depends,
-            are always as the plant draws them. met for those of the real episodes, as in the paper; mixed for new ones
-            that differ from the mean of those met as these do, see :func:`mixed`; or drawn for those of the plant. A
-            policy with hundreds of weights fits itself to a few winds that were met, and few winds do not hold the rare
-            ones that cost most.
+        large_scale: large scale of the disturbances that steps 5 and 6 draw: met for those of the real episodes, as in
+            the paper; mixed for new ones that differ from the mean of those met as these do, see :func:`mixed`; or
+            drawn for those of the plant. A policy with hundreds of weights fits itself to a few winds that were met,
+            and few winds do not hold the rare ones that cost most. Set points, on which no equation depends, are always
+            as the plant draws them.
     """
 
     knots: Annotated[int, Field(ge=8)] = 300

@@ -258,11 +258,11 @@ def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tens
 
 @torch.no_grad()
 def set_points(twin: DigitalTwin, device: torch.device) -> Bool[Tensor, " n_z"]:
-    """Which inputs that act are set points: no equation of the plant depends on them, only costs and observations.
+    """Which inputs that act are set points: no equation of the plant depends on them, only costs and the controller.
 
     Who sets them knows how they will be set, which a few episodes do not show. A policy that is planned on the few that
     were met may fail at all others. An equation depends on an input if an interval ends elsewhere with another one, at
-    some states near the initial ones and some actions.
+    some initial states, states near these, and actions.
 
     Args:
         twin: the twin, whose plant draws states and inputs.
@@ -274,12 +274,16 @@ def set_points(twin: DigitalTwin, device: torch.device) -> Bool[Tensor, " n_z"]:
     inputs, t = drawn[:, moments].flatten(0, 1), plant.dt * moments.double().repeat(DRAWN)
     like = partial(torch.randn, generator=generator, dtype=torch.float64, device=device)
     sizes = torch.tensor(plant.state_sizes or [1.0] * len(plant.states), dtype=torch.float64, device=device)
-    states = plant.draw_initial_state(len(inputs), generator) + sizes * like(len(inputs), len(plant.states))
+    apart = sizes * like(len(inputs), len(plant.states))
+    apart[::2] = 0.0  # every second state stays where the plant is sound
+    states = plant.draw_initial_state(len(inputs), generator) + apart
+    outside = [k for k, signal in enumerate(plant.states) if signal.name not in plant.controller_states]
     low, high = (bound.nan_to_num(posinf=1.0, neginf=-1.0) for bound in bounds(plant.actions, device=device))
     actions = low + (high - low) * like(len(inputs), len(plant.actions)).sigmoid()
 
     def ends(inputs: Tensor) -> Tensor:
-        return torch.cat(plant.step(t, states, actions, inputs, twin.closure), -1).nan_to_num()
+        end, applied = plant.step(t, states, actions, inputs, twin.closure)
+        return torch.cat([end[:, outside], applied], -1).nan_to_num()
 
     usual, free = ends(inputs), []
     for k in range(len(plant.acting_inputs)):

@@ -19,7 +19,6 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, Order
 from rt_torchrl.systems.safety import OperatingLimits, require_layer
 from rt_torchrl.systems.sound_part import (
-    SHORTEST,
     EpisodeEndedError,
     Fault,
     SoundPart,
@@ -43,6 +42,8 @@ class ShortTermMemory(deque[Trajectory]):
         self.extend(Trajectory(**record) for record in state["records"])
 
 
+SHORTEST = 10
+"""Least number of control intervals of a sound part of a real episode, below which it is flown again."""
 LEAST_SOUND = 0.5
 """Least share of a real episode in one sound part, below which it is flown again."""
 TWICE = 2.0

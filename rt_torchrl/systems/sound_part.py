@@ -17,8 +17,6 @@ from rt_torchrl.systems.safety import SafetyReport, layer_of
 
 GREATEST = torch.finfo(torch.float32).max
 """Greatest number to be learned from: the long-term memory keeps its priorities in single precision."""
-SHORTEST = 10
-"""Least number of control intervals of a part that is learned from."""
 LEARNED = ("state", "exogenous", "observation", *(("next", k) for k in ("state", "observation", "applied", "reward")))
 """Entries of an episode that go into a memory."""
 FAULTS = ("missing", "not finite", "out of range", "frozen", "late", "limit", "asked")
