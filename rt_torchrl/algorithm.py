@@ -43,7 +43,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
+from rt_torchrl.steps.inputs import EXTREMES, OFTEN, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
@@ -126,6 +126,8 @@ class ReinforcementTwinning(TensorDictSequential):
                 raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
         fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
+        if twin.plant.end_cost is not None and config.planner.method == "multi_start":
+            judged *= OFTEN
         virtual = VirtualEpisodes(
             twin,
             config.exogenous,

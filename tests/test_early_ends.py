@@ -22,13 +22,14 @@ from rt_torchrl import (
     ReinforcementTwinning,
     SafetyConfig,
     SafetyLayer,
+    SaturatedMLP,
     check_plant,
 )
 from rt_torchrl.control.command_cost import CommandCost
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
@@ -263,18 +264,45 @@ def test_few_weights_are_searched_on_where_gradients_do_not_see_an_end(monkeypat
     episodes = Scenario(torch.zeros(4, 2).double(), plant.draw_exogenous(4, torch.Generator().manual_seed(0)))
     for searches in (False, True):
         planner = WholeEpisodes(DigitalTwin(plant, plant.closure), Pushing(), PlannerConfig(iterations=30))
-        assert planner.searches
-        monkeypatch.setattr(planner, "searches", searches)
+        assert [weight.numel() for weight in planner.searched] == [2]
+        monkeypatch.setattr(planner, "searched", planner.searched if searches else [])
         report = planner.plan(episodes)
         flown = planner.twin.control(planner.policy, *episodes)
         costs[searches] = control_cost(plant, flown).mean().item()
         assert report.best == pytest.approx(costs[searches])
     assert costs[True] < 0.97 * costs[False]
     paper = WholeEpisodes(DigitalTwin(plant, plant.closure), Pushing(), PlannerConfig(method="single_start"))
-    wide = WholeEpisodes(DigitalTwin(plant, plant.closure), torch.nn.Linear(2, 20), PlannerConfig())
     endless = LinearQuadratic()
     smooth = WholeEpisodes(DigitalTwin(endless, endless.closure), Pushing(), PlannerConfig())
-    assert not (paper.searches or wide.searches or smooth.searches)
+    assert not (paper.searched or smooth.searched)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "sizes"), [((3,), [6, 3, 3, 1]), ((16, 16), [16, 16, 1]), ((64,), [1]), ((39,), [39, 1])]
+)
+def test_of_many_weights_those_of_the_output_layer_are_searched(hidden, sizes, monkeypatch):
+    plant = Falling()
+    policy = SaturatedMLP(2, plant.actions, hidden=hidden, generator=torch.Generator().manual_seed(0))
+    planner = WholeEpisodes(DigitalTwin(plant, plant.closure), policy, PlannerConfig(iterations=2))
+    assert [weight.numel() for weight in planner.searched] == sizes
+    monkeypatch.setattr(planner.descent, "run", lambda cost, count: Descended(1.0, 1.0, 0.0, 0))
+    before = [weight.detach().clone() for weight in policy.parameters()]
+    generator = torch.Generator().manual_seed(0)
+    planner.plan(Scenario(plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)))
+    changed = [not torch.equal(*pair) for pair in zip(before, policy.parameters(), strict=True)]
+    assert changed == [False] * (len(before) - len(sizes)) + [True] * len(sizes)
+
+
+def test_policies_are_judged_in_many_episodes_where_ends_are_rare():
+    usual = SMALL.virtual_episodes
+    for plant, method, times in (
+        (Falling(), "multi_start", 20),
+        (Falling(), "single_start", 1),
+        (LinearQuadratic(), "multi_start", 1),
+    ):
+        config = dataclasses.replace(SMALL, planner=PlannerConfig(method=method))
+        steps = algorithm(PlantEnv(plant), plant, config).steps
+        assert {steps["interact"].judged, steps["plan"].judged, steps["learn"].count} == {times * usual}
 
 
 def test_an_end_where_the_plant_has_none_is_refused():

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
-from rt_torchrl.optimisers.simplex import FEW, by_simplex
+from rt_torchrl.optimisers.simplex import by_simplex, searched
 
 SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
 """Adam's options, beside β₂ = 0.99, of the two halves of an approach."""
@@ -48,20 +48,21 @@ def exact_optimum(
     """The best policy of a class, found on the *true* plant and on the unseen episodes themselves.
 
     Every start descends by exact gradients on a few episodes, because a gradient over a hundred episodes takes ten
-    times as long and has the same direction as one over ten. The best start goes on with all episodes. Up to twenty
-    weights are then searched by the simplex of Nelder and Mead, from the best two: exact gradients stay in the next
-    poor minimum of a plant with rate limits, play or stiction.
+    times as long and has the same direction as one over ten. The best start goes on with all episodes. Few weights are
+    then searched by the simplex of Nelder and Mead, from the best two: exact gradients stay in the next poor minimum of
+    a plant with rate limits, play or stiction. Where episodes may end early, which gradients do not see, so are the
+    output layers of policies with more weights.
 
     Args:
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
         starts: number of random initial policies.
-        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes; by default 80, or 300 for more
-            than twenty weights.
+        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes; by default 80, or 300 where
+            weights are many.
         few: number of episodes on which every start descends.
-        polish: gradients of the best start, on all episodes; by default 20, or 150 for more than twenty weights.
-        approach: gradients of Adam from each start before those of L-BFGS; by default none, or 600 for more than twenty
-            weights. L-BFGS alone takes perceptrons to the next poor minimum.
+        polish: gradients of the best start, on all episodes; by default 20, or 150 where weights are many.
+        approach: gradients of Adam from each start before those of L-BFGS; by default none, or 600 where weights
+            are many. L-BFGS alone takes perceptrons to the next poor minimum.
         seed: seed of the initial weights.
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
@@ -77,16 +78,18 @@ def exact_optimum(
         return Descent(policy, TO_THE_END).run(cost, steps).best
 
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
-    count = sum(weight.numel() for weight in policies[0].parameters() if weight.requires_grad)
-    usual = FOR_PERCEPTRONS if count > FEW else FOR_FEW_WEIGHTS
+    trained = [weight for weight in policies[0].parameters() if weight.requires_grad]
+    all_searched = len(searched(policies[0])) == len(trained)
+    usual = FOR_FEW_WEIGHTS if all_searched else FOR_PERCEPTRONS
     requested = {"approach": approach, "iterations": iterations, "polish": polish}
     effort = {name: usual[name] if number is None else number for name, number in requested.items()}
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     best, *others = (policies[k] for k in sorted(range(starts), key=costs.__getitem__))
     by_gradients = descend(best, len(unseen.initial_state), effort["polish"])
     candidates = [(by_gradients, best)]
-    if 0 < count <= FEW:
+    if searched(best) and (all_searched or unseen.plant.end_cost is not None):
         for policy in (copy.deepcopy(best), *others[:1]):
-            by_simplex(policy, cost_of(policy, few), count * ENOUGH, size=0.3)
-            candidates.append((by_simplex(policy, cost_of(policy), count * POLISH, size=0.05), policy))
+            weights = searched(policy)
+            by_simplex(weights, cost_of(policy, few), ENOUGH, size=0.3)
+            candidates.append((by_simplex(weights, cost_of(policy), POLISH, size=0.05), policy))
     return Optimum(*min(candidates, key=lambda pair: pair[0]), costs, by_gradients)

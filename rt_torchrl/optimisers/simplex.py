@@ -1,4 +1,4 @@
-"""The simplex of Nelder and Mead, which searches a few weights without gradients."""
+"""The simplex of Nelder and Mead, which searches few weights without gradients."""
 
 import math
 from collections.abc import Callable
@@ -11,19 +11,29 @@ from torch.nn.utils import parameters_to_vector
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.levenberg_marquardt import place
 
-FEW = 20
+FEW = 40
 """Greatest number of weights that are searched."""
 
 
+def searched(module: nn.Module) -> list[nn.Parameter]:
+    """The trained weights of a module or, of many, the last ones, such as those of an output layer, as far as few."""
+    weights = list[nn.Parameter]()
+    for weight in reversed([weight for weight in module.parameters() if weight.requires_grad]):
+        if sum(part.numel() for part in (weight, *weights)) > FEW:
+            break
+        weights.insert(0, weight)
+    return weights
+
+
 @torch.no_grad()
-def by_simplex(module: nn.Module, cost: Callable[[], Tensor], count: int, *, size: float) -> float:
-    """Search the trained weights of a module without gradients; it gets the best ones.
+def by_simplex(weights: list[nn.Parameter], cost: Callable[[], Tensor], count: int, *, size: float) -> float:
+    """Search weights without gradients; they get the best values.
 
     Args:
-        module: module with the weights.
-        cost: function that returns the scalar cost at the module's present weights; it may raise
-            ``FloatingPointError`` where the cost diverges.
-        count: greatest number of costs.
+        weights: the weights, such as those of :func:`searched`.
+        cost: function that returns the scalar cost at the present weights; it may raise ``FloatingPointError`` where
+            the cost diverges.
+        count: greatest number of costs for each weight.
         size: size of the first simplex, as a share of each weight.
 
     Returns:
@@ -31,7 +41,6 @@ def by_simplex(module: nn.Module, cost: Callable[[], Tensor], count: int, *, siz
     """
     from scipy.optimize import minimize  # here, because the options of a recipe need not wait for it
 
-    weights = [weight for weight in module.parameters() if weight.requires_grad]
     start = parameters_to_vector(weights)
     scale = size * start.abs().clamp_min(0.1)
 
@@ -45,5 +54,11 @@ def by_simplex(module: nn.Module, cost: Callable[[], Tensor], count: int, *, siz
         return value if math.isfinite(value) else math.inf
 
     simplex = np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
-    options = {"maxfev": count, "initial_simplex": simplex, "adaptive": True, "xatol": 1e-6, "fatol": 1e-12}
+    options = {
+        "maxfev": count * len(start),
+        "initial_simplex": simplex,
+        "adaptive": True,
+        "xatol": 1e-6,
+        "fatol": 1e-12,
+    }
     return at(minimize(at, simplex[0], method="Nelder-Mead", options=options).x)

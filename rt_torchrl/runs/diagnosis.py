@@ -110,7 +110,7 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes,
     """
     name, remedy = "the plan is in a poor minimum", "more twinning.planner.starts or iterations, or another --seed"
     if run.physics.end_cost is not None:
-        remedy += ", a policy of at most twenty weights, or a running cost that rises steeply before episodes end early"
+        remedy += ", a policy of at most forty weights, or a running cost that rises steeply before episodes end early"
     role, policy = run.live, run.policy(run.live)
     if isinstance(policy, StateFeedback):
         return costs, Reason(name, None, f"{type(policy).__name__} has no weights that are planned", remedy)

@@ -139,11 +139,11 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
         algorithm: the training at its end.
         untrained: the policies before it.
     """
-    live, supervisor = algorithm.referee.live, algorithm.steps["interact"].supervisor
+    live, interact = algorithm.referee.live, algorithm.steps["interact"]
     policy = algorithm.policies[live]
     if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
         return f"{live} has its random initial weights"
-    return supervisor.refusal(live, supervisor.episodes(config.twinning.virtual_episodes))[0]
+    return interact.supervisor.refusal(live, interact.supervisor.episodes(interact.judged))[0]
 
 
 def announcement(names: Iterable[str], live: Role, count: int) -> str:

@@ -208,7 +208,8 @@ class TwinningConfig:
         realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
-        virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies;
+            twenty times as many where episodes may end early.
         limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
             to be kept before a policy may act.
         exploration: parameters of step 1.

@@ -236,6 +236,9 @@ DRAWS_SEED = 3_000_000
 """Seed of the draws that tell the extreme states and the set points of a plant: the same for every training."""
 DRAWN = 8
 """Number of episodes, and of moments in each, whose inputs tell on which of them no equation depends."""
+OFTEN = 20
+"""How many times as many virtual episodes policies are judged in where episodes may end early: an end in one of a
+hundred, which twenty do not hold, decides which policy is the better one."""
 RARE, FAILURE = 0.01, 10.0
 """Share of all episodes that begin like the extreme ones, and how many times the usual cost they may cost there."""
 

@@ -12,7 +12,7 @@ from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, norm_of
-from rt_torchrl.optimisers.simplex import FEW, by_simplex
+from rt_torchrl.optimisers.simplex import by_simplex, searched
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
@@ -72,7 +72,8 @@ class WholeEpisodes:
     r"""Descends :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
 
     Where real episodes contradict the twin, what it expects on the real system is descended instead. Where episodes may
-    end early, which gradients do not see, the simplex of Nelder and Mead searches on from there, among few weights.
+    end early, which gradients do not see, the simplex of Nelder and Mead searches on from there: all weights of a small
+    policy, or those of the output layer.
 
     Args:
         twin: twin with the best closure so far, w_p*.
@@ -83,10 +84,9 @@ class WholeEpisodes:
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
-        self.count = sum(weight.numel() for weight in policy.parameters() if weight.requires_grad)
         ends = twin.plant.end_cost is not None and config.method != "single_start"
-        self.searches = ends and 0 < self.count <= FEW
-        """Whether the simplex goes on from where a descent ends."""
+        self.searched = searched(policy) if ends else []
+        """Weights that the simplex searches from where a descent ends."""
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
@@ -94,8 +94,8 @@ class WholeEpisodes:
         if self.stalled(descended.start, descended.best, descended.gradient):
             again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
             descended = descended._replace(best=again.best, iterations=descended.iterations + again.iterations)
-        if self.searches:
-            best = by_simplex(self.policy, lambda: self._cost(episodes, math.inf), SEARCHED * self.count, size=0.3)
+        if self.searched:
+            best = by_simplex(self.searched, lambda: self._cost(episodes, math.inf), SEARCHED, size=0.3)
             descended = descended._replace(best=best)
             self.restart()  # the weights have jumped
         return descended
