@@ -43,7 +43,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import EXTREMES, OFTEN, FitInputs, VirtualEpisodes
+from rt_torchrl.steps.inputs import OFTEN, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
@@ -128,13 +128,7 @@ class ReinforcementTwinning(TensorDictSequential):
         judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
         if twin.plant.end_cost is not None and config.planner.method == "multi_start":
             judged *= OFTEN
-        virtual = VirtualEpisodes(
-            twin,
-            config.exogenous,
-            config.experience,
-            extremes=0 if fed_back or config.planner.method == "single_start" else EXTREMES,
-            generator=generator,
-        )
+        virtual = VirtualEpisodes(twin, config.exogenous, config.experience, generator=generator)
         corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
         belief, system = Belief(policies, virtual, corrects=corrects), system_of(env)
         actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)

@@ -33,11 +33,13 @@ from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, LearnerConfig
 from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.interact import RealFlights
 from rt_torchrl.steps.learn import ActorCritic
-from rt_torchrl.steps.plan import WholeEpisodes
+from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -303,6 +305,41 @@ def test_policies_are_judged_in_many_episodes_where_ends_are_rare():
         config = dataclasses.replace(SMALL, planner=PlannerConfig(method=method))
         steps = algorithm(PlantEnv(plant), plant, config).steps
         assert {steps["interact"].judged, steps["plan"].judged, steps["learn"].count} == {times * usual}
+
+
+def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
+    class Greedy:
+        """A planner that plans a weak policy, or a strong one where it sees that the weak one falls."""
+
+        policy, seen = LinearGain([[3.0, 2.0]]), list[torch.Tensor]()
+
+        def plan(self, episodes):
+            self.seen.append(episodes.initial_state[:, 0])
+            wary = bool((episodes.initial_state[:, 0] > 0.5).any())
+            self.policy.load_state_dict({"gain": torch.tensor(STRONG if wary else WEAK).double()})
+            return Descended(1.0, 0.5, 0.0, 1)
+
+        def restart(self):
+            pass
+
+        def state_dict(self):
+            return {}
+
+    plant, planner = Falling(noise=0.0), Greedy()
+    virtual = VirtualEpisodes(
+        DigitalTwin(plant, plant.closure), ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0)
+    )
+    still = torch.zeros(12, plant.n_steps, 1).double()
+    planned_on = Scenario(torch.zeros(3, 2).double(), still[:3])
+    judged_on = Scenario(
+        torch.zeros(12, 2)
+        .double()
+        .index_put((torch.tensor(7), torch.tensor(0)), torch.tensor(0.9, dtype=torch.float64)),
+        still,
+    )
+    report = MultiStart(planner, Belief({}, virtual), PlannerConfig()).plan(1, planned_on, judged_on)
+    assert [len(starts) for starts in planner.seen] == [3, 8] and planner.seen[1][3] == 0.9
+    assert planner.policy.gain.tolist() == STRONG and report["plan_accepted"] == 1.0
 
 
 def test_an_end_where_the_plant_has_none_is_refused():

@@ -28,6 +28,8 @@ GRADIENT_LIMIT = 10.0
 where the first one gains nothing beside a mean gradient that is longer."""
 SEARCHED = 40
 """Number of costs for each weight of a search without gradients."""
+DEAREST = 5
+"""Number of judged episodes with which a plan that is refused is made again, where they may end early."""
 NOTHING = 1e-3
 """Share of a cost that a descent must gain, where its gradient promises much more."""
 STRIDE = 1_000_003
@@ -305,34 +307,44 @@ class MultiStart:
         return best._replace(report=best.report.update(metrics(start=float(start))))
 
     def _from_the_present(self, present: Weights, before: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
-        """A plan from the present weights, or these; one that fails from extreme starts is made again on these, too."""
+        """A plan from the present weights, or these where it is expected to cost more.
+
+        Where episodes may end early, a plan that is refused is made again with those of the others in which it was
+        dearest: the few that it was made on do not hold a rare end.
+        """
         policy, episodes = self.planner.policy, planned_on
         while True:
-            report = self._descended(episodes, usual=planned_on)
+            report = self._descended(episodes)
             if not report["plan_accepted"]:
                 return Plan(present, before, report)
             cost = self.belief.judge(policy, judged_on)
             if cost <= before and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
+            ends = self.virtual.twin.plant.end_cost is not None
+            dearest = self._dearest(judged_on) if ends and math.isfinite(cost.on_twin) else None
             policy.load_state_dict(present)
             self.planner.restart()
-            fails_at_extremes = len(self.virtual.extremes) and cost.on_twin <= before.on_twin
-            if not fails_at_extremes or episodes is not planned_on:
+            if dearest is None or episodes is not planned_on:
                 refused = metrics(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
                 return Plan(present, before, report.update(refused))
-            episodes = self.virtual.with_extremes(planned_on)
+            episodes = Scenario(*(torch.cat(pair) for pair in zip(planned_on, dearest, strict=True)))
 
-    def _descended(self, episodes: Scenario, usual: Scenario | None = None) -> TensorDict:
-        """The report of a descent; the weights stay as they were if the twin diverges where it begins.
+    @torch.no_grad()
+    def _dearest(self, episodes: Scenario) -> Scenario:
+        """The episodes that cost most under the present weights."""
+        rows = (
+            self.virtual.twin.episode_costs(self.planner.policy, *episodes).topk(min(DEAREST, len(episodes[0]))).indices
+        )
+        return Scenario(*(values[rows] for values in episodes))
 
-        The twin must be sound in the usual episodes alone: what has just flown may diverge from extreme starts.
-        """
+    def _descended(self, episodes: Scenario) -> TensorDict:
+        """The report of a descent; the weights stay as they were if the twin diverges where it begins."""
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         try:
             return planned(self.planner.plan(episodes))
         except FloatingPointError:
-            self.belief.require_sound_twin(episodes if usual is None else usual)
+            self.belief.require_sound_twin(episodes)
             policy.load_state_dict(before)
             self.planner.restart()
             return metrics("no plan: the twin diverges", plan_accepted=0.0)
