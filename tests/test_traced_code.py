@@ -1,5 +1,6 @@
 """The contract of traced code: right, or refused with the line and the remedy; nothing is silently wrong."""
 
+import gc
 import re
 import warnings
 from collections import OrderedDict
@@ -42,6 +43,27 @@ def test_refused_with_the_line_of_the_code_and_the_remedy(case):
         traced(snippet, *signals(11, 3))
     assert re.search(r"snippets\.(py|txt):\d+: .", str(refusal.value)) or case == "deepcopy", refusal.value
     assert re.search(REMEDIES, str(refusal.value))
+
+
+def test_what_other_libraries_do_in_a_collection_of_garbage_is_not_traced():
+    """JAX adds a callback like this one, which reads what may change."""
+    collected = []
+
+    def callback(phase, info):
+        collected.append(phase)
+
+    def collecting(module, state, drive):
+        return state + len([[k] for k in range(1000)])
+
+    threshold = gc.get_threshold()
+    gc.callbacks.append(callback)
+    gc.set_threshold(1)
+    try:
+        found, exact = compared(Snippet(collecting), *signals(11, 3))[0]
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(callback)
+    assert collected and gc.isenabled() and gap(found, exact) < 1e-10
 
 
 @pytest.mark.parametrize("case", IMPURE)

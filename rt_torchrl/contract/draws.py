@@ -22,7 +22,8 @@ def signals(plant: Plant) -> Iterator[str]:
     for group in GROUPS:
         declared = getattr(plant, group, None)
         if not isinstance(declared, tuple) or not all(isinstance(signal, Signal) for signal in declared):
-            yield f"{group}: is {declared!r}; expected a tuple of Signal, declared on the class."
+            or_by = " (or by measurements there)" if group == "observations" else ""
+            yield f"{group}: is {declared!r}; expected a tuple of Signal, declared on the class{or_by}."
             continue
         if not declared and group != "inputs":
             yield f"{group}: is empty; declare at least one Signal (only inputs may be empty)."

@@ -18,6 +18,7 @@ import dataclasses
 import dis
 import enum
 import functools
+import gc
 import hashlib
 import inspect
 import os
@@ -274,12 +275,15 @@ class Executed:
     @contextmanager
     def noted(self) -> Iterator[None]:
         """A context in which functions are noted."""
-        before = sys.getprofile()
+        before, collects = sys.getprofile(), gc.isenabled()
+        gc.disable()  # other libraries, such as JAX, call functions of theirs in each collection
         sys.setprofile(self._note)
         try:
             yield
         finally:
             sys.setprofile(before if callable(before) else None)
+            if collects:
+                gc.enable()
             if before is not None and not callable(before):  # the profiler of Python before version 3.12
                 before.enable()
 

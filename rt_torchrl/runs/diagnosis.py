@@ -170,7 +170,8 @@ def _merits(run: LoadedRun) -> Reason:
     live, others = run.live, unseen["baselines"]
     merit = unseen["merit"][live]
     if not merit or not others:
-        return Reason(name, None, "no classical controller flew beside the policy, or the plant has no merit", remedy)
+        missing = "the plant has no merit" if others else "no classical controller flew beside the policy"
+        return Reason(name, None, missing, remedy)
     cost, differences = unseen[f"J_a_{live}"]["mean"], []
     for key, other in others.items():
         if cost is None or other["J_a"]["mean"] is None or cost >= other["J_a"]["mean"]:

@@ -289,11 +289,13 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += merit_lines(unseen)
     lines += real_lines(summary.get("real_unseen"), summary["twin"]["segment"])
     paid = summary["cost_of_learning"]
-    least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
-    judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
+    whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
+    judging = paid.get("judging", [])
+    spent = _number(None if None in judging else sum(judging), ".4g")
+    after = f", {spent} of it over {len(judging)} after the training" if judging else ""
     lines.append(
-        f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {least} over "
-        f"{paid['episodes']} episodes{judging}, largest {most}"
+        f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {whole} over "
+        f"{paid['episodes']} episodes{after}, largest {most}"
     )
     lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
@@ -448,8 +450,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
     elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
         better = best if best is not None and cost >= known[best] else "the controller that flew first"
-        longer = "go on with --resume and more --episodes, or train with more --twinning.planner.iterations"
-        steps.append(f"{better} is better than the live policy: keep it, {longer}")
+        other = "let the policy observe what that controller computes, or train with more --twinning.planner.iterations"
+        steps.append(f"{better} is better than the live policy: keep it, {other}")
     elif summary["better"] != live:
         steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
     elif not alone:
