@@ -30,12 +30,10 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-FIRST = 3 * ("short", "whole")
-"""Stages of the first fit: steps over segments, and over whole records."""
-AGAIN = ("short",)
-"""Stages of every further fit, in which whole records have hardly ever found more."""
+FIRST, AGAIN = 3, 1
+"""Greatest numbers of stages of the first fit, and of every further one."""
 STEPS = 10
-"""Greatest number of Levenberg-Marquardt steps over segments in a stage."""
+"""Greatest number of Levenberg-Marquardt steps in a stage."""
 HELD = 0.1
 """Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one.
 Without this prior the weights that the records hardly show spoil the steps, and many weights follow noise."""
@@ -139,15 +137,14 @@ def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
 
 
 class Fit:
-    """The fit of one hypothesis: steps over segments, at first in turns with whole records; the best weights stay.
+    """The fit of one hypothesis over segments that begin with what was read (multiple shooting); the best weights stay.
 
-    Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
-    what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
-    Where some steps over segments have not arrived, the methods take turns, and each frees the other.
+    Over a whole record of a system that oscillates nearly every weight has local minima. Over segments it has few; the
+    hidden states go on through all of them, with their derivatives.
 
     Args:
         twin: twin of the hypothesis, whose closure is updated in place.
-        config: parameters of step 4, for the whole records.
+        config: parameters of step 4.
         segment: number of control intervals of a segment.
     """
 
@@ -164,21 +161,21 @@ class Fit:
         )
         self.short = Assimilation(twin.of(Reread(twin.plant)), short)
         self.whole = Assimilation(twin, measured)
+        """What tells the errors over records, which is not fitted."""
         self.least = math.inf
         self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator, length: int = 0) -> float:
-        """Fit the records: by both stages in turn the first time, by steps over segments from then on.
+        """Fit the records.
 
-        Where these have not arrived, and much more is left over than the last time, the fit also begins anew from the
-        first weights: those of the last episode may explode on these records, and no step leads back from there.
+        Where the steps have not arrived, and much more is left over than the last time, the fit also begins anew from
+        the first weights: those of the last episode may explode on these records, and no step leads back from there.
 
         Args:
             records: the records.
             generator: source of random numbers.
-            length: number of control intervals of the segments in the place of whole records, which a twin of an
-                unstable system leaves; 0 for whole records.
+            length: number of control intervals of the segments over which errors are reported; 0 for whole records.
 
         Returns:
             The misfit of the best weights, which the closure has then.
@@ -195,10 +192,8 @@ class Fit:
         self.least = least
         return least
 
-    def _run(
-        self, records: Sequence[Trajectory], stages: Sequence[str], generator: torch.Generator
-    ) -> tuple[float, bool]:
-        """Go through stages until steps over segments have arrived.
+    def _run(self, records: Sequence[Trajectory], stages: int, generator: torch.Generator) -> tuple[float, bool]:
+        """Go through stages until the steps have arrived.
 
         Returns:
             The misfit of the best weights, which the closure has then, and whether the steps have arrived.
@@ -206,26 +201,20 @@ class Fit:
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         if self._held and math.isfinite(least):  # see HELD
-            self.short.prior.stiffness = self.whole.prior.stiffness = HELD * least
-        read_again = [reread(record, plant, self.segment) for record in records]
-        arrived = False
-        for name in stages:
+            self.short.prior.stiffness = HELD * least
+        read_again, steps = [reread(record, plant, self.segment) for record in records], STEPS
+        while stages and steps == STEPS:
             safe_point()
-            steps = STEPS
-            # A twin that diverges on the way only loses the stage.
-            with contextlib.suppress(FloatingPointError):
-                stage, replayed = (self.short, read_again) if name == "short" else (self.whole, self.rested(records))
-                steps = stage.update(replayed, (), 1, generator).iterations
+            stages -= 1
+            with contextlib.suppress(FloatingPointError):  # a twin that diverges on the way only loses the stage
+                steps = self.short.update(read_again, (), 1, generator).iterations
             present = misfit(self.twin, records, self.segment)
             if present < least:
                 least, best = present, copy.deepcopy(closure.state_dict())
             elif not present < FAR * least:
                 closure.load_state_dict(best)
-            arrived = name == "short" and steps < STEPS
-            if arrived:
-                break
         closure.load_state_dict(best)
-        return least, arrived
+        return least, steps < STEPS
 
     def cost(self, records: Sequence[Trajectory]) -> float:
         """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
