@@ -43,7 +43,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import OFTEN, FitInputs, VirtualEpisodes
+from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
@@ -64,6 +64,9 @@ ARMS = {
     "model_based": ("interact", "inputs", "assimilate", "plan"),
 }
 """Steps of each arm, in their order."""
+OFTEN = 20
+"""How many times as many virtual episodes policies are judged in where episodes may end early: an end in one of a
+hundred, which twenty do not hold, decides which policy is the better one."""
 
 
 class ReinforcementTwinning(TensorDictSequential):

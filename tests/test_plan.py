@@ -15,8 +15,6 @@ from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, Planner
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 
-CPU = torch.device("cpu")
-
 
 class Still(WholeEpisodes):
     """A planner whose descents end where they begin; ``begun`` are the weights of each."""

@@ -16,7 +16,7 @@ FEW = 40
 
 
 def searched(module: nn.Module) -> list[nn.Parameter]:
-    """The trained weights of a module or, of many, the last ones, such as those of an output layer, as far as few."""
+    """The trained weights of a module; of one with more than ``FEW``, the last ones, such as an output layer's."""
     weights = list[nn.Parameter]()
     for weight in reversed([weight for weight in module.parameters() if weight.requires_grad]):
         if sum(part.numel() for part in (weight, *weights)) > FEW:

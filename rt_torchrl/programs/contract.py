@@ -282,10 +282,10 @@ class Executed:
             yield
         finally:
             sys.setprofile(before if callable(before) else None)
-            if collects:
-                gc.enable()
             if before is not None and not callable(before):  # the profiler of Python before version 3.12
                 before.enable()
+            if collects:
+                gc.enable()
 
     def _note(self, frame: types.FrameType, event: str, argument: object) -> None:
         code, namespace = frame.f_code, frame.f_globals

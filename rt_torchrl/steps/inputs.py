@@ -231,9 +231,6 @@ DRAWS_SEED = 3_000_000
 """Seed of the draws that tell the set points of a plant: the same for every training."""
 DRAWN = 8
 """Number of episodes, and of moments in each, whose inputs tell on which of them no equation depends."""
-OFTEN = 20
-"""How many times as many virtual episodes policies are judged in where episodes may end early: an end in one of a
-hundred, which twenty do not hold, decides which policy is the better one."""
 
 
 @torch.no_grad()

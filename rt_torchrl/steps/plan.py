@@ -263,7 +263,7 @@ class MultiStart:
         """
         policy = self.planner.policy
         if not self.judges:
-            return self._descended(planned_on)
+            return self._descended(planned_on, planned_on)
         present = copy.deepcopy(policy.state_dict())
         self.belief.require_sound_twin(judged_on)
         before = self.belief.judge(policy, judged_on)
@@ -314,37 +314,40 @@ class MultiStart:
         """
         policy, episodes = self.planner.policy, planned_on
         while True:
-            report = self._descended(episodes)
+            report = self._descended(episodes, usual=planned_on)
             if not report["plan_accepted"]:
                 return Plan(present, before, report)
             cost = self.belief.judge(policy, judged_on)
             if cost <= before and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
-            ends = self.virtual.twin.plant.end_cost is not None
-            dearest = self._dearest(judged_on) if ends and math.isfinite(cost.on_twin) else None
+            again = episodes is planned_on and math.isfinite(cost.on_twin)
+            again = again and self.virtual.twin.plant.end_cost is not None
+            if again:
+                episodes = self._with_dearest(planned_on, judged_on)  # of the plan, before it is taken back
             policy.load_state_dict(present)
             self.planner.restart()
-            if dearest is None or episodes is not planned_on:
+            if not again:
                 refused = metrics(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
                 return Plan(present, before, report.update(refused))
-            episodes = Scenario(*(torch.cat(pair) for pair in zip(planned_on, dearest, strict=True)))
 
     @torch.no_grad()
-    def _dearest(self, episodes: Scenario) -> Scenario:
-        """The episodes that cost most under the present weights."""
-        rows = (
-            self.virtual.twin.episode_costs(self.planner.policy, *episodes).topk(min(DEAREST, len(episodes[0]))).indices
-        )
-        return Scenario(*(values[rows] for values in episodes))
+    def _with_dearest(self, episodes: Scenario, others: Scenario) -> Scenario:
+        """Some episodes, and those of others that cost most under the policy as it is."""
+        costs = self.virtual.twin.episode_costs(self.planner.policy, *others)
+        rows = costs.topk(min(DEAREST, len(costs))).indices
+        return Scenario(*(torch.cat([some, more[rows]]) for some, more in zip(episodes, others, strict=True)))
 
-    def _descended(self, episodes: Scenario) -> TensorDict:
-        """The report of a descent; the weights stay as they were if the twin diverges where it begins."""
+    def _descended(self, episodes: Scenario, usual: Scenario) -> TensorDict:
+        """The report of a descent; the weights stay as they were if the twin diverges where it begins.
+
+        The twin must be sound in the usual episodes alone: what has just flown may fail in the dearest ones of a plan.
+        """
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         try:
             return planned(self.planner.plan(episodes))
         except FloatingPointError:
-            self.belief.require_sound_twin(episodes)
+            self.belief.require_sound_twin(usual)
             policy.load_state_dict(before)
             self.planner.restart()
             return metrics("no plan: the twin diverges", plan_accepted=0.0)
