@@ -43,7 +43,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import FitInputs, VirtualEpisodes
+from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
@@ -129,9 +129,10 @@ class ReinforcementTwinning(TensorDictSequential):
                 raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
         fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
-        if twin.plant.end_cost is not None and config.planner.method == "multi_start":
-            judged *= OFTEN
-        virtual = VirtualEpisodes(twin, config.exogenous, config.experience, generator=generator)
+        extremes = EXTREMES if config.planner.method == "multi_start" else 0
+        if extremes and twin.plant.end_cost is not None:  # many episodes hold extreme starts, too
+            judged, extremes = OFTEN * judged, 0
+        virtual = VirtualEpisodes(twin, config.exogenous, config.experience, extremes=extremes, generator=generator)
         corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
         belief, system = Belief(policies, virtual, corrects=corrects), system_of(env)
         actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)

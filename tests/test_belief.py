@@ -28,7 +28,8 @@ class ByGain(VirtualEpisodes):
 
     def __init__(self):
         plant = LinearQuadratic(horizon=2.0)
-        self.twin, self.flights, self.processes = DigitalTwin(plant, LinearClosure(plant.true_closure)), 0, [None]
+        self.twin, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), ()
+        self.flights, self.processes = 0, [None]
 
     def draw(self, count):
         return EPISODES

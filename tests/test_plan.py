@@ -6,14 +6,18 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from test_algorithm import twinning, weights
-from test_belief import EPISODES, REFUTED, belief_of, gains, said
+from test_belief import EPISODES, REFUTED, Content, belief_of, gains, said
+from test_first_controller import begun
 
-from rt_torchrl import Descended, DescentConfig, DigitalTwin
+from rt_torchrl import Descended, DescentConfig, DigitalTwin, Scenario
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.steps import plan
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
-from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.inputs import VirtualEpisodes, extreme_states
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
+
+CPU = torch.device("cpu")
 
 
 class Still(WholeEpisodes):
@@ -146,3 +150,79 @@ def test_a_plan_that_is_stuck_is_made_from_other_weights_too(limit, led_back, mo
 def test_a_descent_stalls_where_it_gains_nothing_of_what_its_gradient_promises(before, after, promised, expected):
     planner = Still(LinearGain([[3.0, 4.0]]), belief_of().virtual)
     assert planner.stalled(before, after, promised / 5.0) is expected
+
+
+def test_extreme_starts_are_beyond_nearly_all_random_ones():
+    plant = LinearQuadratic(horizon=1.0)
+    found = extreme_states(plant, 1000, CPU)
+    drawn = plant.draw_initial_state(5000, torch.Generator().manual_seed(0))
+    assert found.shape == (4, 2)
+    for column in range(2):
+        beyond = (drawn[:, column] > found[:, column].max()) | (drawn[:, column] < found[:, column].min())
+        assert beyond.double().mean() < 0.01
+    assert not len(extreme_states(plant, 0, CPU))
+    assert not len(extreme_states(FlappingWing(), 1000, CPU))  # its flights begin at rest in the origin
+
+
+class Trapped(VirtualEpisodes):
+    """Virtual episodes in which a gain costs itself, and a gain below 1 costs 1000 from the extreme starts."""
+
+    def __init__(self, extremes=1000):
+        plant = LinearQuadratic(horizon=2.0)
+        twin = DigitalTwin(plant, plant.closure)
+        super().__init__(twin, ExogenousConfig(), 1, extremes=extremes, generator=torch.Generator().manual_seed(0))
+
+    def cost(self, policy, episodes):
+        gain = policy.gain.detach().sum().item()
+        return 1000.0 if (episodes.initial_state.abs() > 3.0).any() and gain < 1.0 else gain
+
+
+class Greedy(Content):
+    """A planner that goes to a small gain, or to a greater one where it sees extreme starts."""
+
+    def __init__(self, policy, wary):
+        super().__init__(policy)
+        self.wary = wary
+
+    def plan(self, episodes):
+        with torch.no_grad():
+            self.policy.gain.fill_(0.75 if self.wary and len(episodes.initial_state) > 1 else 0.25)
+        return Descended(4.0, 0.5, 0.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("wary", "extremes", "kept"), [(True, 1000, 0.75), (False, 1000, 1.0), (False, 0, 0.25), (True, 0, 0.25)]
+)
+def test_a_plan_that_fails_from_extreme_starts_is_made_again_with_them(wary, extremes, kept):
+    policy = LinearGain([[1.0, 1.0]])
+    planning = MultiStart(Greedy(policy, wary), Belief({}, Trapped(extremes)), PlannerConfig())
+    report = planning.plan(1, EPISODES, EPISODES)
+    assert policy.gain.tolist() == [[kept, kept]] and report["plan_accepted"] == float(kept != 1.0)
+
+
+def test_episodes_from_extreme_starts_have_the_inputs_of_others_and_count_where_they_fail():
+    virtual, policy = Trapped(), LinearGain([[0.5, 0.0]])
+    inputs = torch.arange(3.0).double().reshape(3, 1, 1)
+    beside = virtual.with_extremes(Scenario(torch.zeros(3, 2).double(), inputs))
+    assert beside.exogenous.flatten().tolist() == [0.0, 1.0, 2.0, 0.0, 1.0, 2.0, 0.0]
+    assert torch.equal(beside.initial_state[3:], virtual.extremes)
+    assert virtual.judge(policy, EPISODES) == (0.5 + 0.01 * (1000.0 - 5.0), 0.5)
+
+
+@pytest.mark.parametrize(("dear", "imitates_there"), [(False, False), (True, True)])
+def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, imitates_there, monkeypatch):
+    found, drawn = begun(), []
+    imitate, judge, teacher = found.steps["switch"].imitation.imitate, found.virtual.judge, found.first.teacher
+
+    def seen(live, idle, *, seen, draw):
+        drawn.append(len(draw().initial_state))
+        return imitate(live, idle, seen=seen, draw=draw)
+
+    def judged(policy, episodes):
+        cost, on_twin = judge(policy, episodes)
+        return (cost if policy is teacher or not dear else 100.0 * cost), on_twin
+
+    monkeypatch.setattr(found.steps["switch"].imitation, "imitate", seen)
+    monkeypatch.setattr(found.virtual, "judge", judged)
+    found.start()
+    assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies

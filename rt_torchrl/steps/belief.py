@@ -88,8 +88,8 @@ class Judged(NamedTuple):
     """What a policy costs; the smaller one is the better one.
 
     Attributes:
-        expected: the cost that is expected on the real system.
-        on_twin: mean J_a on the twin.
+        expected: the cost that is expected on the real system, extreme episodes included.
+        on_twin: mean J_a on the twin, which decides where extreme episodes diverge anyway.
     """
 
     expected: float
@@ -275,8 +275,8 @@ class Belief:
 
     def judge(self, policy: nn.Module, episodes: Scenario) -> Judged:
         """What a policy costs, by its flights in virtual episodes and by the belief."""
-        cost = self.virtual.cost(policy, episodes)
-        return Judged(self.expected(policy, cost), cost)
+        cost, on_twin = self.virtual.judge(policy, episodes)
+        return Judged(self.expected(policy, cost), on_twin)
 
     @torch.no_grad()
     def expected(self, policy: nn.Module, cost: float) -> float:

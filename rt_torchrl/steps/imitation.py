@@ -37,6 +37,8 @@ SAMPLES = 5000
 """Greatest number of observations from each source; a source with more is thinned evenly."""
 BLOWN_UP = 1e3
 """Observation, which is of order one in a sound flight, beyond which a twin has blown up."""
+TWICE = 2.0
+"""Cost over the controller's, extreme episodes included, beyond which an imitation learns from these, too."""
 
 
 class Imitation:
@@ -125,20 +127,25 @@ class Imitation:
     def _begun(
         self, teacher: nn.Module | None, role: Role, policy: nn.Module, records: Trajectory, judged_on: Scenario
     ) -> TensorDict:
-        before, start = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on)
+        before, start = copy.deepcopy(policy.state_dict()), self.virtual.judge(policy, judged_on)
         if teacher is None:
             error = self._match(policy, [self._of_record(records)])
             teacher_cost = control_cost(self.virtual.twin.plant, records).mean().item()
         else:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
             error = self.imitate(teacher, policy, seen=records, draw=draw)
-            teacher_cost = self.virtual.cost(teacher, judged_on)
-        cost = self.virtual.cost(policy, judged_on)
-        entries = {f"start_error_{role}": error, f"start_cost_ratio_{role}": min(cost, start) / teacher_cost}
+            model, teacher_cost = self.virtual.judge(teacher, judged_on)
+            if len(self.virtual.extremes) and self.virtual.judge(policy, judged_on)[0] > TWICE * abs(model):
+                policy.load_state_dict(before)
+                error = self.imitate(teacher, policy, seen=records, draw=lambda: self.virtual.with_extremes(draw()))
+        cost = self.virtual.judge(policy, judged_on)
+        entries = {f"start_error_{role}": error, f"start_cost_ratio_{role}": min(cost, start)[1] / teacher_cost}
         if cost <= start:
             return metrics(**entries)
         policy.load_state_dict(before)
-        return metrics(f"{role} does not imitate the controller: it would cost {cost:.4g}, not {start:.4g}", **entries)
+        return metrics(
+            f"{role} does not imitate the controller: it would cost {cost[0]:.4g}, not {start[0]:.4g}", **entries
+        )
 
     def imitate(
         self,

@@ -16,10 +16,12 @@ from jaxtyping import Bool, Complex, Float
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.report import Step, record_of
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -227,10 +229,31 @@ def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "s
     return (vectors * scale.unsqueeze(-2)) @ vectors.mH
 
 
+EXTREMES = 1000
+"""Number of random initial states among which the extreme ones are found: twenty virtual episodes do not show what a
+policy does in one of hundreds."""
 DRAWS_SEED = 3_000_000
-"""Seed of the draws that tell the set points of a plant: the same for every training."""
+"""Seed of the draws that tell the extreme states and the set points of a plant: the same for every training."""
 DRAWN = 8
 """Number of episodes, and of moments in each, whose inputs tell on which of them no equation depends."""
+RARE, FAILURE = 0.01, 10.0
+"""Share of all episodes that begin like the extreme ones, and how many times the usual cost they may cost there."""
+
+
+def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tensor, "k n_s"]:
+    """The extremes of each state among many random initial states; none of a state that is always the same.
+
+    The weights of a policy that saturates hardly depend on what lies beyond the starts that it was planned on: a plan
+    may do the opposite there of what it does everywhere else, and twenty draws do not show it.
+
+    Args:
+        plant: the plant, which draws the initial states.
+        count: number of random initial states; 0 for no extremes.
+        device: device of the states.
+    """
+    drawn = plant.draw_initial_state(max(count, 1), torch.Generator(device=device).manual_seed(DRAWS_SEED))
+    varied = drawn[:, (drawn != drawn[0]).any(0)]
+    return drawn[torch.cat([varied.argmin(0), varied.argmax(0)]).unique()]
 
 
 @torch.no_grad()
@@ -277,6 +300,7 @@ class VirtualEpisodes:
         twin: twin on which the episodes are flown.
         config: parameters of the fit of a process to a real episode's exogenous input.
         experience: number of latest real episodes whose processes are kept.
+        extremes: number of random initial states whose extremes count where policies are compared; 0 for none.
         generator: source of every draw.
     """
 
@@ -286,12 +310,14 @@ class VirtualEpisodes:
         config: ExogenousConfig,
         experience: int,
         *,
+        extremes: int = 0,
         generator: torch.Generator,
     ):
         self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
         self.recorded: Tensor | None = None
         """Initial state of the last whole real episode."""
+        self.extremes = extreme_states(twin.plant, extremes, generator.device)
         self.set_points = set_points(twin, generator.device)
 
     def learn(self, record: Trajectory) -> None:
@@ -371,6 +397,27 @@ class VirtualEpisodes:
             return math.inf
         return cost if math.isfinite(cost) else math.inf
 
+    def judge(self, policy: nn.Module, episodes: Scenario) -> tuple[float, float]:
+        """The cost by which policies are compared, which counts failures in extreme episodes; and mean J_a.
+
+        Extreme episodes begin with the extremes of each state, under the inputs of the others in turn. What they cost
+        beyond ten times J_a counts as if one episode in a hundred were one. State feedback is asked for J_a alone,
+        because model predictive control takes too long in further episodes.
+        """
+        cost = self.cost(policy, episodes)
+        if not len(self.extremes) or isinstance(policy, StateFeedback):
+            return cost, cost
+        beyond = self.cost(policy, self._extreme(episodes)) - FAILURE * abs(cost)
+        return cost + RARE * max(0.0, beyond) if math.isfinite(cost) else cost, cost
+
+    def with_extremes(self, episodes: Scenario) -> Scenario:
+        """Some episodes, and the extreme ones under their inputs, if there are some."""
+        return both(episodes, self._extreme(episodes)) if len(self.extremes) else episodes
+
+    def _extreme(self, episodes: Scenario) -> Scenario:
+        order = torch.arange(len(self.extremes), device=self.extremes.device) % len(episodes.exogenous)
+        return Scenario(self.extremes, episodes.exogenous[order])
+
     def state_dict(self) -> dict[str, Any]:
         return {"processes": [process.state_dict() for process in self.processes], "recorded": self.recorded}
 
@@ -380,6 +427,11 @@ class VirtualEpisodes:
             ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
         )
         self.recorded = state["recorded"]
+
+
+def both(episodes: Scenario, others: Scenario) -> Scenario:
+    """Some episodes, and others."""
+    return Scenario(*(torch.cat(pair) for pair in zip(episodes, others, strict=True)))
 
 
 class FitInputs(Step):

@@ -15,6 +15,7 @@ from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, norm
 from rt_torchrl.optimisers.simplex import by_simplex, searched
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.inputs import both
 from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -309,8 +310,9 @@ class MultiStart:
     def _from_the_present(self, present: Weights, before: Judged, planned_on: Scenario, judged_on: Scenario) -> Plan:
         """A plan from the present weights, or these where it is expected to cost more.
 
-        Where episodes may end early, a plan that is refused is made again with those of the others in which it was
-        dearest: the few that it was made on do not hold a rare end.
+        A plan that fails from extreme starts alone is made again on these, too. Where episodes may end early, one that
+        is refused is made again with those of the others in which it was dearest: the few that it was made on do not
+        hold a rare end.
         """
         policy, episodes = self.planner.policy, planned_on
         while True:
@@ -320,27 +322,32 @@ class MultiStart:
             cost = self.belief.judge(policy, judged_on)
             if cost <= before and math.isfinite(cost.on_twin):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
-            again = episodes is planned_on and math.isfinite(cost.on_twin)
-            again = again and self.virtual.twin.plant.end_cost is not None
-            if again:
-                episodes = self._with_dearest(planned_on, judged_on)  # of the plan, before it is taken back
+            first = episodes is planned_on  # the plan still has its weights
+            further = self._further(cost, before, planned_on, judged_on) if first else None
             policy.load_state_dict(present)
             self.planner.restart()
-            if not again:
+            if further is None:
                 refused = metrics(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
                 return Plan(present, before, report.update(refused))
+            episodes = further
 
     @torch.no_grad()
-    def _with_dearest(self, episodes: Scenario, others: Scenario) -> Scenario:
-        """Some episodes, and those of others that cost most under the policy as it is."""
-        costs = self.virtual.twin.episode_costs(self.planner.policy, *others)
-        rows = costs.topk(min(DEAREST, len(costs))).indices
-        return Scenario(*(torch.cat([some, more[rows]]) for some, more in zip(episodes, others, strict=True)))
+    def _further(self, cost: Judged, before: Judged, planned_on: Scenario, judged_on: Scenario) -> Scenario | None:
+        """The episodes on which a plan that is refused is made again; None where none of them says why it fails."""
+        twin = self.virtual.twin
+        if twin.plant.end_cost is None:
+            fails = len(self.virtual.extremes) and cost.on_twin <= before.on_twin
+            return self.virtual.with_extremes(planned_on) if fails else None
+        if not math.isfinite(cost.on_twin):
+            return None
+        costs = twin.episode_costs(self.planner.policy, *judged_on)
+        dearest = costs.topk(min(DEAREST, len(costs))).indices
+        return both(planned_on, Scenario(*(values[dearest] for values in judged_on)))
 
     def _descended(self, episodes: Scenario, usual: Scenario) -> TensorDict:
         """The report of a descent; the weights stay as they were if the twin diverges where it begins.
 
-        The twin must be sound in the usual episodes alone: what has just flown may fail in the dearest ones of a plan.
+        The twin must be sound in the usual episodes alone: what has just flown may fail in further ones.
         """
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
