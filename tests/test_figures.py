@@ -173,7 +173,8 @@ def test_learning_curves_and_timeline(oscillator):
     episodes = [cost | {"live": role} for cost, role in zip(costs, live, strict=True)]
     figure = figures.learning_curves(replace(oscillator, episodes=episodes))
     control, identification, strip = figure.axes
-    assert list(line(control, "real system, live").get_ydata()) == [4.0, 3.0, 2.0, 1.0]
+    curve = line(control, "real system, live")
+    assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([1, 2, 3, 4], [4.0, 3.0, 2.0, 1.0])
     # J_a spans less than a decade and J_p spans three.
     assert (control.get_yscale(), identification.get_yscale()) == ("linear", "log")
     spans = [
@@ -182,7 +183,7 @@ def test_learning_curves_and_timeline(oscillator):
         if bars.get_alpha() == 1.0
     ]
     assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
-    assert spans == [[(-0.5, 0.5), (0.5, 1.5)], [(1.5, 2.5), (2.5, 3.5)]]
+    assert spans == [[(0.5, 1.5), (1.5, 2.5)], [(2.5, 3.5), (3.5, 4.5)]]
     assert draw(figure) and not collisions(figure)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+import sys
 from unittest.mock import Mock
 
 import pytest
@@ -101,19 +102,32 @@ def test_it_names_each_step_as_it_begins():
     assert told == STEPS and set(dashboard.WORDS) == {"start", *STEPS}
 
 
-def test_it_shows_the_step_and_the_costs_of_the_last_episode(capsys):
-    with Progress(3) as bar:
-        bar.doing("assimilate")
-        bar.episode({"real_cost": 0.25, "live": "model_free"})
-        bar.doing("drawing figures")
+def test_it_shows_the_step_and_the_costs_of_the_last_episode(monkeypatch, capsys):
+    with monkeypatch.context() as terminal:
+        terminal.setattr(sys.stderr, "isatty", lambda: True)
+        with Progress(3) as bar:
+            bar.doing("assimilate")
+            bar.episode({"episode": 1, "real_cost": 0.25, "live": "model_free"})
+            bar.doing("drawing figures")
     shown = capsys.readouterr().err
     assert "assimilating" in shown and "1/3" in shown and "real 0.25, live model-free; drawing figures" in shown
+
+
+def test_a_log_has_a_line_for_each_episode_and_for_what_begins_after_a_while(monkeypatch, capsys):
+    with Progress(3) as bar:
+        bar.doing("checking the gradient")
+        bar.doing("assimilate")
+        bar.episode({"episode": 1, "real_cost": 0.25, "live": "model_free"})
+        monkeypatch.setattr(dashboard, "QUIET", 0.0)
+        bar.doing("plan")
+    expected = ["checking the gradient", "episode 1/3: real 0.25, live model-free", "planning"]
+    assert capsys.readouterr().err.splitlines() == expected
 
 
 def test_it_says_when_another_twin_is_believed(capsys):
     record = {"real_cost": 0.25, "live": "model_free", "J_p": 1.0}
     with Progress(4) as bar:
-        for episode, believed in enumerate((None, "pitch lag, late by 3", "pitch lag, late by 3", None)):
+        for episode, believed in enumerate((None, "pitch lag, late by 3", "pitch lag, late by 3", None), 1):
             bar.episode(record | {"episode": episode, "believed": believed})
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "is the likeliest" in line]
     assert lines == [
@@ -233,7 +247,7 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
 
 
 def test_every_window_is_paid_and_episodes_are_counted_from_one():
-    episodes = [{"episode": 0, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 1, "real_cost": 1.0}]
+    episodes = [{"episode": 1, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 2, "real_cost": 1.0}]
     assert cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
     lines = alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
     assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]

@@ -35,7 +35,7 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     kept = {f"checkpoint-000{k}.pt" for k in (2, 3, 4)}
     assert {path.name for path in tmp_path.glob("checkpoint*")} == kept
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
-    assert [record["episode"] for record in metrics["episodes"]] == [0, 1, 2, 3]
+    assert [record["episode"] for record in metrics["episodes"]] == [1, 2, 3, 4]
     promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
     assert all(promised <= record.keys() for record in metrics["episodes"])
     summary = metrics["summary"]

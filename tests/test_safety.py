@@ -162,7 +162,7 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
         assert applied(fly(env, [float("nan")] + [3.0] * 19))[:12] == [-1.0] * 10 + [2.0] * 2
         assert env.report.counts == {"asked": 1, "fallback": 10, "range": 10, "not finite": 1}
     found = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in range(2) for k in range(20)]
+    assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in (1, 2) for k in range(20)]
     assert found[0]["asked"] == [None] and found[0]["applied"] == [-1.0] and "asked" in found[0]["reasons"]
 
 

@@ -141,7 +141,7 @@ def learning_curves(snapshot: Snapshot) -> Figure:
     for (name, curves), ax in zip(panels, axes, strict=True):
         for key, look in curves.items():
             if np.isfinite(column := _column(episodes, key)).any():
-                ax.plot(np.arange(len(episodes)), column, linewidth=1.4, markersize=4, **look)
+                ax.plot(np.arange(1, len(episodes) + 1), column, linewidth=1.4, markersize=4, **look)
         style.logarithmic_if_wide(ax)
         legend_above(ax)
         caption(ax, name)
@@ -167,7 +167,7 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     title = "Closure weights of the twin over the episodes"
     figure, axes = style.grid(len(columns), wide, title=title, size=size, xlabel="episode")
     for ax, (name, values) in zip(axes, columns.items(), strict=True):
-        ax.plot(np.arange(len(values)), values, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
+        ax.plot(np.arange(1, len(values) + 1), values, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if name in start:
             ax.axhline(start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
@@ -213,13 +213,13 @@ def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None
     acted = [episode.get("live") or live for episode in episodes]
     for row, role in enumerate(reversed(ROLES)):
         for is_live, alpha in ((True, 1.0), (False, 0.15)):
-            spans = [(k - 0.5, 1.0) for k, actor in enumerate(acted) if (actor == role) == is_live]
+            spans = [(k - 0.5, 1.0) for k, actor in enumerate(acted, 1) if (actor == role) == is_live]
             ax.broken_barh(spans, (row - 0.4, 0.8), facecolors=ROLES[role], alpha=alpha, linewidth=0)
     ax.set_yticks(range(len(ROLES)), [role_name(role) for role in reversed(ROLES)])
     ax.set_ylim(-0.55, len(ROLES) - 0.45)
     ax.grid(False)
     caption(ax, "live (filled) and idle (pale)")
-    ax.set_xlim(-0.5, len(episodes) - 0.5)
+    ax.set_xlim(0.5, len(episodes) + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 

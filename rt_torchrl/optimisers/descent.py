@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import Limit, NotNegative, Positive, configuration
@@ -50,12 +51,6 @@ class Descended(NamedTuple):
     iterations: int
 
 
-def norm_of(parts: list[Tensor]) -> Float[Tensor, ""]:
-    """The norm of a vector in parts."""
-    norms = torch._foreach_norm(parts)
-    return norms[0] if len(norms) == 1 else torch.linalg.vector_norm(torch.stack(norms))
-
-
 def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], limit: float) -> Float[Tensor, ""]:
     r"""The mean of costs, with a limit for the gradient of each.
 
@@ -82,7 +77,7 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     gradients = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
     slopes = [torch.stack(parts) for parts in zip(*gradients, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
-    allowed = limit * costs.detach().abs() / norm_of([weight.detach() for weight in weights])
+    allowed = limit * costs.detach().abs() / get_total_norm([weight.detach() for weight in weights])
     # A cost of zero says nothing about what is long.
     shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)
     mean = costs.detach().mean()

@@ -1,5 +1,7 @@
 """What a training shows while it runs: the TensorBoard dashboard and the progress bar."""
 
+import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -121,8 +123,12 @@ WORDS = {
 """Words in which the bar shows each step of the algorithm."""
 
 
+QUIET = 10.0
+"""Time for which a log says nothing before it names the step that begins [s]."""
+
+
 class Progress:
-    """A bar over the real episodes, with the costs of the last one and the present step.
+    """A bar over the real episodes, with the costs of the last one and the present step; lines where no terminal is.
 
     Args:
         total: number of real episodes of the training.
@@ -130,7 +136,8 @@ class Progress:
     """
 
     def __init__(self, total: int, done: int = 0):
-        self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True)
+        self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True, disable=None)
+        self._total, self._line_at = total, -QUIET
         self._costs, self._doing, self._alarm = "", "starting", False
         self._believed: str | None = None
 
@@ -146,6 +153,8 @@ class Progress:
         """Show what begins now: the name of a step of the algorithm, or any other words."""
         self._doing = WORDS.get(what, what)
         self._show()
+        if time.monotonic() - self._line_at > QUIET:
+            self._log(self._doing)
 
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
@@ -156,19 +165,26 @@ class Progress:
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:
             message = record.get("warning", "the twin's predictions hold again")
-            self.write(f"episode {record['episode'] + 1}: {message}")
+            self.write(f"episode {record['episode']}: {message}")
         self._alarm = alarm
         believed = record.get("believed")
         if believed != self._believed:
             twin = f"the twin with {believed!r}" if believed else "the twin alone"
-            self.write(f"episode {record['episode'] + 1}: {twin} is the likeliest; J_p and closure are its own")
+            self.write(f"episode {record['episode']}: {twin} is the likeliest; J_p and closure are its own")
         self._believed = believed
         self._bar.update()
         self._show()
+        self._log(f"episode {record['episode']}/{self._total}: {self._costs}")
 
     def write(self, line: str) -> None:
         """Write a line above the bar."""
         self._bar.write(line)
+
+    def _log(self, line: str) -> None:
+        """Write a line where the bar is not shown: into a file or a pipe."""
+        if self._bar.disable:
+            print(line, file=sys.stderr, flush=True)
+            self._line_at = time.monotonic()
 
     def _show(self) -> None:
         self._bar.set_postfix_str("; ".join(part for part in (self._costs, self._doing) if part))

@@ -34,7 +34,7 @@ def episode_record(entries: TensorDict, *, episode: int) -> dict[str, Any]:
 
     Args:
         entries: return value of :meth:`ReinforcementTwinning.episode`.
-        episode: number of the episode, from 0.
+        episode: number of the episode, from 1.
     """
     record: dict[str, Any] = {"episode": episode, "event": "keep"}
     for key in entries.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
@@ -416,7 +416,7 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     raised = sum(record["alarm"] > 0.0 for record in watched)
     text = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
     warned = [record for record in watched if record.get("warning")][-1:]
-    return [f"  {text}", *(f"  episode {record['episode'] + 1}: {record['warning']}" for record in warned)]
+    return [f"  {text}", *(f"  episode {record['episode']}: {record['warning']}" for record in warned)]
 
 
 def dearer_than_first(summary: Mapping[str, Any]) -> str:

@@ -232,7 +232,7 @@ class Run:
             metrics = self._results(gap, flights, judged, real)
             if self.config.figures:
                 bar.doing("drawing the figures")
-                dashboard.images(self._drawn(flights, judged), len(self.episodes) - 1)
+                dashboard.images(self._drawn(flights, judged), len(self.episodes))
         table = results_table(metrics)
         dashboard.results(metrics["summary"], table)
         dashboard.close()
@@ -262,16 +262,17 @@ class Run:
                 bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to end at once)")
 
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
-        record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
+        number = len(self.episodes) + 1
+        record = results.episode_record(self.algorithm.episode(bar.doing), episode=number)
         record |= results.twin_entries(self.algorithm.twin)
         if self._doubts:
             record["doubts"], self._doubts = list(self._doubts), ()
         if self.algorithm.flights.faults:
             record["faults"] = [fault._asdict() for fault in self.algorithm.flights.faults]
             for fault in self.algorithm.flights.faults:
-                bar.write(f"episode {record['episode'] + 1}, {fault.time:g} s: {fault.kind}: {fault.detail}")
+                bar.write(f"episode {record['episode']}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         interval = self.config.unseen_every
-        if interval and (len(self.episodes) + 1) % interval == 0:
+        if interval and number % interval == 0:
             self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"

@@ -23,7 +23,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
-from torch.nn.utils import parameters_to_vector
+from torch.nn.utils import get_total_norm, parameters_to_vector
 from torch.optim.adam import adam
 from torch.utils._pytree import tree_flatten
 from torchrl.data import Bounded, LazyTensorStorage, MultiStep, RoundRobinWriter, TensorDictPrioritizedReplayBuffer
@@ -31,7 +31,6 @@ from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, Value
 from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, SoftUpdate, TD3Loss
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.optimisers.descent import norm_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
@@ -539,12 +538,12 @@ class Iteration:
             gradients = slopes(loss, learner.critic_adam.weights)
             errors = learner.sizes(transitions["td_error"].detach())
             results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
-            results["critic_gradient"] = norm_of(gradients)
+            results["critic_gradient"] = get_total_norm(gradients)
             steps.append((learner.critic_adam, gradients))
         if self.actor:
             loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
             gradients = slopes(loss, learner.actor_adam.weights)
-            norm = norm_of(gradients)
+            norm = get_total_norm(gradients)
             share = (learner.method.gradient_limit / (norm + TINY)).clamp(max=1.0)
             results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
             steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector
+from torch.nn.utils import get_total_norm, parameters_to_vector
 
 from rt_torchrl.control.predictive_control import PredictiveControl
-from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean, norm_of
+from rt_torchrl.optimisers.descent import Descended, Descent, limited_mean
 from rt_torchrl.optimisers.simplex import by_simplex, searched
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
@@ -110,7 +110,7 @@ class WholeEpisodes:
         """
         if self.config.method == "single_start":
             return False
-        promised = gradient * norm_of([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
+        promised = gradient * get_total_norm([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
         return before - after <= NOTHING * abs(before) and promised > GRADIENT_LIMIT * abs(before)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:

@@ -44,8 +44,8 @@ class SafetyEvent(NamedTuple):
     system has left its limits.
     """
 
-    episode: int
-    step: int
+    episode: int  # from 1
+    step: int  # from 0
     time: float  # start of the interval, counted from the start of the episode [s]
     reasons: dict[str, str]
     asked: list[float]
@@ -385,7 +385,7 @@ class SafetyLayer(AroundSystem):
             return
         command, sent = requested.flatten().tolist(), applied.flatten().tolist()
         t = self._step_count * self.config.interval
-        event = SafetyEvent(self._episodes - 1, self._step_count, t, reasons, command, sent, time.time())
+        event = SafetyEvent(self._episodes, self._step_count, t, reasons, command, sent, time.time())
         self.report.events.append(event)
         self.report.counts.update(reasons.keys())
         if self.config.log is not None and self._unwritten is None:
