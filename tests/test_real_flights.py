@@ -15,7 +15,7 @@ from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
+from rt_torchrl import PlantEnv, Reading, RealSystem, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 
 STEPS = 20
@@ -101,6 +101,34 @@ def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
     assert finished.simulate(finished.policy("model_based"), on="twin").states.isfinite().all()
     assert {"states", "flights"} <= set(finished.figure_names())
     assert "States, flight on the twin" in draw(finished.figure("states"))
+
+
+class Blind(PlantEnv):
+    """A simulation whose state cannot be read in the seventh interval of some episodes."""
+
+    blind = ()
+
+    def _step(self, tensordict):
+        found = super()._step(tensordict)
+        if self._episodes in self.blind and self._step_count == 7:
+            found["state"] = torch.full_like(found["state"], torch.nan)
+        return found
+
+
+@pytest.mark.parametrize(("blind", "flights"), [((2,), 3), ((2, 3, 4), None)])
+def test_a_judged_flight_with_a_refused_reading_is_flown_again(blind, flights):
+    """Its cost would be that of the reading which stands in for it."""
+    plant, entries = LinearQuadratic(horizon=2.0), {key: Reading(keys=(key,)) for key in ("state", "exogenous")}
+    machine = Blind(plant, seed=0)
+    layer = SafetyLayer(machine, SafetyConfig(interval=plant.dt), fallback=(0.0,))
+    system = RealSystem(layer, plant, **entries, applied=Reading(keys=("applied",)), seed=0)
+    begun, machine.blind = machine._episodes, [machine._episodes + k for k in blind]
+    if flights is None:
+        with pytest.raises(ValueError, match="3 real episodes in a row cannot be used: the safety layer refused 1 of"):
+            RealEpisodes(system, 2).fly(LinearGain([[-0.5, -0.5]]))
+        return
+    flown = RealEpisodes(system, 2).fly(LinearGain([[-0.5, -0.5]]))
+    assert machine._episodes == begun + flights and flown.states.isfinite().all()
 
 
 class Asked(RealController):

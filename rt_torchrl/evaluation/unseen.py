@@ -264,16 +264,35 @@ class RealEpisodes(UnseenEpisodes):
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
-        """Fly as many episodes on the real system, whose training episodes then go on as if it had not."""
+        """Fly as many episodes on the real system, whose training episodes then go on as if it had not.
+
+        An episode with a reading that a safety layer refuses is flown again: its cost would be that of another reading.
+
+        Raises:
+            ValueError: if the system ends an episode, or several in a row have such readings.
+        """
         if isinstance(policy, RealController):
             return policy.fly_real(self._count, seed=UNSEEN_SEED)
         state = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
-            flown = [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(self._count)]
+            flown = [self._flight(policy) for _ in range(self._count)]
         finally:
             self._system.load_state_dict(state)
-        return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
+        return batch_of([self._to_the_horizon(episode) for episode in flown])
+
+    def _flight(self, policy: nn.Module) -> "TensorDictBase":
+        """An episode in which all readings are right."""
+        from rt_torchrl.systems.sound_part import FLIGHTS, report_of, sound_part, tried_in_vain
+
+        refused = list[str]()
+        while len(refused) < FLIGHTS:
+            episode = self._system.rollout(self.plant.n_steps, self._actor(policy))[0]
+            sound = sound_part(episode, self.plant, report_of(self._system))
+            if sound.whole:
+                return episode
+            refused.append(sound.reason)
+        raise ValueError(tried_in_vain(refused))
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""

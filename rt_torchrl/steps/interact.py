@@ -19,6 +19,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, Order
 from rt_torchrl.systems.safety import OperatingLimits, require_layer
 from rt_torchrl.systems.sound_part import (
+    FLIGHTS,
     EpisodeEndedError,
     Fault,
     SoundPart,
@@ -50,8 +51,6 @@ TWICE = 2.0
 """Cost that is expected of a policy over that of the controller that flew first, beyond which the policy is not tried.
 
 A policy that costs less shows how the real system answers other actions, without which plans do not improve."""
-FLIGHTS = 3
-"""Number of real episodes in a row without a sound part after which somebody has to look at the machine."""
 
 
 class Flight(NamedTuple):

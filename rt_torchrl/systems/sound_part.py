@@ -21,6 +21,8 @@ LEARNED = ("state", "exogenous", "observation", *(("next", k) for k in ("state",
 """Entries of an episode that go into a memory."""
 FAULTS = ("missing", "not finite", "out of range", "frozen", "late", "limit", "asked")
 """Reasons of a safety layer's events that are faults of the system, or of a policy that asks for no number."""
+FLIGHTS = 3
+"""Number of real episodes in a row with too few right readings after which somebody has to look at the machine."""
 
 
 class Fault(NamedTuple):
@@ -140,9 +142,9 @@ def _reported(report: SafetyReport | None) -> list[Fault]:
 
 
 def tried_in_vain(reasons: Sequence[str]) -> str:
-    """The error of several real episodes in a row from which nothing can be learned."""
+    """The error of several real episodes in a row that say too little."""
     return (
-        f"{len(reasons)} real episodes in a row cannot be learned from: {'; '.join(dict.fromkeys(reasons))}. None of "
+        f"{len(reasons)} real episodes in a row cannot be used: {'; '.join(dict.fromkeys(reasons))}. None of "
         "them was stored; mend the system, its sensors, or the ranges of the safety layer, and go on with the next "
         "episode."
     )
