@@ -11,14 +11,8 @@ from tensordict import TensorDict
 from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, PlantEnv, ReinforcementTwinning
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import (
-    AssimilationConfig,
-    LearnerConfig,
-    PlannerConfig,
-    RefereeConfig,
-    TwinningConfig,
-    other_than,
-)
+from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
+from rt_torchrl.steps.switch import other_than
 
 STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 

@@ -9,10 +9,11 @@ from test_algorithm import LEARNING, STEPS, flown, twinning, weights
 
 from rt_torchrl import DigitalTwin, SaturatedAffine, SaturatedMLP, Scenario
 from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig, other_than
+from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import same_architecture
+from rt_torchrl.steps.switch import other_than
 
 PLANT = LinearQuadratic(horizon=2.0)
 

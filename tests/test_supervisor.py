@@ -13,7 +13,8 @@ from rt_torchrl import ClassicalController, OperatingLimits, PlantEnv, Run, RunC
 from rt_torchrl.options import read_options
 from rt_torchrl.runs.real_side import simulated
 from rt_torchrl.runs.settings import as_written
-from rt_torchrl.steps.config import RefereeConfig, other_than
+from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.switch import other_than
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})

@@ -21,11 +21,6 @@ EXPERIENCE = 100
 LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
 
 
-def other_than(role: Role) -> Role:
-    """The other one of the two roles."""
-    return "model_based" if role == "model_free" else "model_free"
-
-
 @configuration
 class LearnerConfig:
     """Parameters of step 2.

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import ROLES, RefereeConfig, Role, other_than
+from rt_torchrl.steps.config import ROLES, RefereeConfig, Role
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
 from rt_torchrl.steps.plan import Planner
@@ -18,6 +18,11 @@ from rt_torchrl.steps.report import Step, merged, metrics, record_of
 Event = Literal["keep", "swap", "clone"]
 STALL = 0.5
 """Relative weight change T_w below which the idle policy has stalled; P_w decides how soon that makes it a clone."""
+
+
+def other_than(role: Role) -> Role:
+    """The other one of the two roles."""
+    return "model_based" if role == "model_free" else "model_free"
 
 
 class Evidence(NamedTuple):
