@@ -60,6 +60,9 @@ def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
         assert J_p == pytest.approx(0.1 * 0.5 * (parts**2).sum(1).mean(), rel=1e-7)
     samples = parts if initial == "estimated" else parts[:, 1:]
     assert fit.report() == {"rms/position [m]": pytest.approx(np.sqrt((samples**2).mean()), rel=1e-6)}
+    for length, used in ((7, 7), (50, 20)):  # a shorter record shortens no segments of later ones
+        fit.update([record.part(0, length, 0.1)], [], 1, torch.Generator())
+        assert fit.length == used
 
 
 @pytest.mark.parametrize("closure", ["paper", "mlp"])

@@ -169,6 +169,7 @@ def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
         torch.testing.assert_close(twin.replayed(record, fit.whole.length), record.states)
         flown = batch_of([record._replace(states=states)])
         assert unseen.identification_costs(real, real.closure, flown, fit.whole.length).item() < 1e-20
+    assert fit.cost([record.part(0, 7, PLANT.dt)]) < 1e-20  # of an episode that ended before a segment does
 
 
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():

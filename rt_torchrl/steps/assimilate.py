@@ -105,12 +105,13 @@ class Assimilation:
             return self._descend_anew(whole)
         if self.config.segment is None:
             return self._over_chosen_segments(whole)
-        self.length = min(self.length, whole.actions.shape[1])
+        self.length = min(self.config.segment, whole.actions.shape[1])
         return self._descend_anew(self.in_segments(whole))
 
     def in_segments(self, whole: Trajectory) -> Trajectory:
-        """Records as the last fit replayed them: in segments, or whole."""
-        return whole.segments(self.length, self.twin.plant.dt) if self.length else whole
+        """Records as the last fit replayed them: in segments, of shorter records in shorter ones, or whole."""
+        length = min(self.length, whole.actions.shape[1])
+        return whole.segments(length, self.twin.plant.dt) if length else whole
 
     def _over_chosen_segments(self, whole: Trajectory) -> Descended:
         """Descend over whole records, or over segments if the twin is unstable and leaves these."""
