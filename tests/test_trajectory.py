@@ -23,6 +23,7 @@ from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, 
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories import twin as twin_module
 from rt_torchrl.trajectories.engines import parallel
+from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)
@@ -75,6 +76,14 @@ def test_segments_are_parts_on_the_clock_of_the_plant():
     for part, segment in zip(parts, segments, strict=True):
         assert all(torch.equal(a, b) for a, b in zip(part, segment, strict=True) if isinstance(a, torch.Tensor))
         assert part.states.shape == (5, 2) and part.seen.shape == (5,) and part.actions.shape == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "pieces"), [((50, 1, 50), [50, 50]), ((40, 50), [40, 40]), ((3, 9), [3] * 4), ((120, 50), [50] * 3)]
+)
+def test_an_episode_that_ended_at_once_cuts_no_other_record_to_pieces(lengths, pieces):
+    records = [Trajectory(*(torch.zeros(n + k, 1) for k in (1, 0, 0))) for n in lengths]
+    assert [len(piece.actions) for piece in pieces_of_equal_length(records, 50, 0.1)] == pieces
 
 
 def test_records_that_are_no_numbers_or_do_not_fit_are_refused(unchecked):

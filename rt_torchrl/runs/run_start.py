@@ -23,11 +23,9 @@ from rt_torchrl.steps.config import ROLES
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.trajectory import pieces_of_equal_length
+from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-SHORTEST = 10
-"""Least number of control intervals of a part of a log."""
 MakesStart = Callable[[Plant, nn.Module], Start | None]
 """Function of the twin's physics and closure, both on their device, that makes the start."""
 

@@ -29,7 +29,7 @@ from rt_torchrl.systems.sound_part import (
 )
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import SHORTEST, Scenario, Trajectory
 
 
 class ShortTermMemory(deque[Trajectory]):
@@ -43,8 +43,6 @@ class ShortTermMemory(deque[Trajectory]):
         self.extend(Trajectory(**record) for record in state["records"])
 
 
-SHORTEST = 10
-"""Least number of control intervals of a sound part of a real episode, below which it is flown again."""
 LEAST_SOUND = 0.5
 """Least share of a real episode in one sound part, below which it is flown again."""
 TWICE = 2.0

@@ -101,8 +101,14 @@ def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts), seen)
 
 
+SHORTEST = 10
+"""Least number of control intervals of a record from which much is learned."""
+
+
 def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: float) -> list[Trajectory]:
     """Segments of a log cut to pieces of one length, which is chosen so that most of the log stays.
+
+    An episode that ended at once leaves few intervals, to which longer segments are not cut.
 
     Args:
         segments: segments of the log, oldest first.
@@ -113,7 +119,8 @@ def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: flo
         The pieces, oldest first; a shorter rest at the end of a segment is left out.
     """
     counts = [len(segment.actions) for segment in segments]
-    length = max({min(count, longest) for count in counts}, key=lambda n: (n * sum(c // n for c in counts), n))
+    lengths = {min(count, longest) for count in counts}
+    length = max({n for n in lengths if n >= SHORTEST} or lengths, key=lambda n: (n * sum(c // n for c in counts), n))
     cuts = [(segment, k * length) for segment, c in zip(segments, counts, strict=True) for k in range(c // length)]
     return [segment.part(first, first + length, dt) for segment, first in cuts]
 
