@@ -1,5 +1,7 @@
 """Networks in closures and in the vector field: starts, bounds, closed forms, and as a hypothesis beside others."""
 
+import copy
+
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
@@ -18,7 +20,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
-from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
+from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, Fit
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -221,6 +223,22 @@ def test_its_plans_are_hardly_ever_worse(force, noise):
     _, alone, others, with_it, weights = compared(force, noise)
     assert with_it < 1.02 * min(others, alone)
     assert (weights == {ALONE: 1.0}) == ((force, noise) in UNSEEN)
+
+
+def test_a_fit_goes_on_as_without_a_resumption_where_the_last_weights_diverge():
+    """What holds the weights of a residual is a share of a misfit, and that of weights that diverge says nothing."""
+    (record,) = records(Real(FORCES[MAGNETS], horizon=5.0), 0.05, count=1)
+    plant, fits = pushed(LinearQuadratic(horizon=5.0)), []
+    for _ in range(2):
+        closure = plant.extended(LinearClosure([[0.0, 0.0], [0.0, 0.0]]))
+        fits.append(Fit(DigitalTwin(plant, closure), ASSIMILATION, 25))
+    fits[0].update([record], torch.Generator())
+    fits[1].load_state_dict(copy.deepcopy(fits[0].state_dict()))
+    for fit in fits:
+        fit.twin.closure.base.matrix.data.fill_(1e9)
+        fit.update([record], torch.Generator())
+    one, other = (fit.twin.closure.state_dict() for fit in fits)
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_noise_does_not_call_for_it_where_the_plant_is_right():

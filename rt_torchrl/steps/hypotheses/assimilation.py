@@ -200,8 +200,9 @@ class Fit:
         """
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
-        if self._held and math.isfinite(least):  # see HELD
-            self.short.prior.stiffness = HELD * least
+        shown = least if math.isfinite(least) else self.least
+        if self._held and math.isfinite(shown):  # see HELD
+            self.short.prior.stiffness = HELD * shown
         read_again, steps = [reread(record, plant, self.segment) for record in records], STEPS
         while stages and steps == STEPS:
             safe_point()
