@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
 from small_plants import flown
 
@@ -208,4 +208,16 @@ def test_set_points_are_drawn_by_the_plant_although_some_were_met():
     spread = (virtual.draw(200).exogenous[:, -1] - record.exogenous[-1]).std(0)
     assert spread[1] > 0.8 > 0.5 > spread[0]
     assert ((virtual.draw(200, recorded=True).exogenous[:, -1] - record.exogenous[-1]).std(0) < 0.5).all()
-    assert not set_points(DigitalTwin(LinearQuadratic(), LinearQuadratic().closure), torch.device("cpu")).any()
+    virtual.processes.clear()
+    virtual.learn(record.part(0, 12, plant.dt))  # of a log
+    assert virtual.draw(2).exogenous.shape == (2, 12, 2)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.1])
+def test_an_input_whose_weight_is_not_yet_trained_is_no_set_point(gain):
+    class Unknown(LinearQuadratic):
+        def vector_field(self, t, state, action, exogenous, closure):
+            return super().vector_field(t, state, action, 0.0 * exogenous, lambda state: state) + closure(exogenous)
+
+    twin = DigitalTwin(Unknown(), LinearClosure([[gain], [gain]]))
+    assert set_points(twin, torch.device("cpu")).tolist() == [False]

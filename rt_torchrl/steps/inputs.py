@@ -4,6 +4,7 @@ A Gaussian process around the large scale of a recorded input gives other possib
 the processes of the latest real episodes, and policies are compared in them.
 """
 
+import copy
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -281,9 +282,13 @@ def set_points(twin: DigitalTwin, device: torch.device) -> Bool[Tensor, " n_z"]:
     low, high = (bound.nan_to_num(posinf=1.0, neginf=-1.0) for bound in bounds(plant.actions, device=device))
     actions = low + (high - low) * like(len(inputs), len(plant.actions)).sigmoid()
 
+    varied = copy.deepcopy(twin.closure)  # a weight of an input may be zero before it is trained
+    for weight in varied.parameters():
+        weight += 0.01 * (1.0 + weight.abs())
+
     def ends(inputs: Tensor) -> Tensor:
-        end, applied = plant.step(t, states, actions, inputs, twin.closure)
-        return torch.cat([end[:, outside], applied], -1).nan_to_num()
+        flown = [plant.step(t, states, actions, inputs, closure) for closure in (twin.closure, varied)]
+        return torch.cat([part for end, applied in flown for part in (end[:, outside], applied)], -1).nan_to_num()
 
     usual, free = ends(inputs), []
     for k in range(len(plant.acting_inputs)):
@@ -384,7 +389,7 @@ class VirtualEpisodes:
             return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
         exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
         if set_points:
-            drawn = plant.draw_exogenous(count, self.generator)[..., : exogenous.shape[-1]]
+            drawn = plant.draw_exogenous(count, self.generator)[:, : exogenous.shape[1], : exogenous.shape[2]]
             exogenous = torch.where(self.set_points, drawn, exogenous)
         return Scenario(initial_state, plant.with_previews(exogenous))
 
