@@ -231,6 +231,7 @@ class ReinforcementTwinning(TensorDictSequential):
             return episode
         flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
+        counted = len(records[-1].actions) + flights[-1].after[0]
         for flight in flights:
             self.steps["learn"].store(flight.parts)
             self.short_term.append(flight.record)
@@ -240,14 +241,13 @@ class ReinforcementTwinning(TensorDictSequential):
                 self.virtual.learn(flight.record)
         if on_twin:
             self.steps["assimilate"].fit(records)
-            self.assimilation.explain(self.belief.replayed(records), self.generator)
+            self.assimilation.explain(self.belief.replayed(records, counted), self.generator)
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)
         report = imitation.begin(self.first.teacher, imitating, flown, on_twin=on_twin)
-        if len(records[-1].actions) != self.twin.plant.n_steps:
-            self.short_term.clear()  # later records are whole episodes
-            if not flights[-1].ended:
-                self.virtual.processes.clear()
+        if counted != self.twin.plant.n_steps:  # later records are those of whole episodes
+            self.short_term.clear()
+            self.virtual.processes.clear()
         start_cost = torch.stack([flight.cost for flight in flights]).mean()
         return merged(merged(episode, report), metrics(start_cost=start_cost))
 

@@ -42,7 +42,7 @@ from rt_torchrl.steps.report import metrics, same_architecture
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, whole_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 HISTORY = 20
@@ -260,17 +260,21 @@ class Belief:
         return beyond(differences[-1], self.flown[-1].exploration)
 
     @torch.no_grad()
-    def replayed(self, records: Sequence[Trajectory]) -> float:
+    def replayed(self, records: Sequence[Trajectory], n: int) -> float:
         """Greatest size of the paired differences of records whose actions the twin replays.
 
         It takes the place of :attr:`unexplained` where no policy can fly them again.
+
+        Args:
+            records: the records, of equal length.
+            n: number of intervals that count, which are more than those of records that ended early.
         """
         whole, twin = batch_of(records), self.virtual.twin
         try:
             flown = twin.replay(whole.states[:, 0], whole.exogenous, whole.actions, start=whole.start)
         except DivergenceError:
             return DEARER
-        real, predicted = (control_cost(twin.plant, flights).tolist() for flights in (whole, flown))
+        real, predicted = (whole_cost(twin.plant, flights, n).tolist() for flights in (whole, flown))
         return max(abs(difference(*pair)) for pair in zip(real, predicted, strict=True))
 
     def judge(self, policy: nn.Module, episodes: Scenario) -> Judged:
