@@ -273,6 +273,9 @@ def test_few_weights_are_searched_on_where_gradients_do_not_see_an_end(monkeypat
         costs[searches] = control_cost(plant, flown).mean().item()
         assert report.best == pytest.approx(costs[searches])
     assert costs[True] < 0.97 * costs[False]
+    idle = WholeEpisodes(planner.twin, Pushing(), PlannerConfig(iterations=0))
+    idle.plan(episodes)
+    assert torch.equal(idle.policy.push, Pushing().push)
     paper = WholeEpisodes(DigitalTwin(plant, plant.closure), Pushing(), PlannerConfig(method="single_start"))
     endless = LinearQuadratic()
     smooth = WholeEpisodes(DigitalTwin(endless, endless.closure), Pushing(), PlannerConfig())
@@ -443,6 +446,12 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
     assert imitated and not any(plant.ended(observations).any() for observations in imitated)
     choice = found.steps["interact"].supervisor.choose("model_based", 5)
     assert choice.role == "first" and "would leave the limits" in choice.report["reason"]
+    (record,) = found.short_term  # the twin is fitted to it with those to come
+    with torch.no_grad():
+        found.twin.closure.matrix.copy_(torch.tensor(plant.true_closure) + torch.tensor([[0.0, 0.0], [-0.02, 0.0]]))
+    replayed = found.twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
+    assert plant.ended(record.states[-1]) and not plant.ended(replayed.states).any()
+    assert found.belief.replayed([record], plant.n_steps) < 0.01  # a moment earlier or later hardly costs anything
 
 
 def test_the_anchored_replay_of_an_end_that_noise_hides_costs_what_the_episode_did():

@@ -97,7 +97,7 @@ class WholeEpisodes:
         if self.stalled(descended.start, descended.best, descended.gradient):
             again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
             descended = descended._replace(best=again.best, iterations=descended.iterations + again.iterations)
-        if self.searched:
+        if self.searched and self.config.iterations:
             best = by_simplex(self.searched, lambda: self._cost(episodes, math.inf), SEARCHED, size=0.3)
             descended = descended._replace(best=best)
             self.restart()  # the weights have jumped
@@ -384,7 +384,8 @@ class MultiStart:
         seed = (source.initial_seed() + STRIDE * episode) % SEEDS
         generator = torch.Generator(device=source.device).manual_seed(seed)
         kept = copy.deepcopy(policy.state_dict())
-        trained = {name for name, weight in policy.named_parameters() if weight.requires_grad}
+        named = policy.named_parameters(remove_duplicate=False)  # a shared weight has several names
+        trained = {name for name, weight in named if weight.requires_grad}
         best: tuple[float, Weights] = math.inf, kept
         for _ in range(self.count):
             drawn = self.make_policy(generator).state_dict()
