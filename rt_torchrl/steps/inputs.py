@@ -284,7 +284,7 @@ def set_points(twin: DigitalTwin, device: torch.device) -> Bool[Tensor, " n_z"]:
 
     varied = copy.deepcopy(twin.closure)  # a weight of an input may be zero before it is trained
     for weight in varied.parameters():
-        weight += 0.01 * (1.0 + weight.abs())
+        weight.add_(0.01 * (1.0 + weight.abs()))
 
     def ends(inputs: Tensor) -> Tensor:
         flown = [plant.step(t, states, actions, inputs, closure) for closure in (twin.closure, varied)]
