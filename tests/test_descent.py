@@ -8,6 +8,7 @@ from torch import nn
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, limited_mean
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.optimisers.simplex import by_simplex
 
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
 CURVATURE = torch.tensor([1.0, 4.0, 10.0], dtype=torch.float64)
@@ -219,6 +220,20 @@ def test_newton_steps_take_a_negative_cost_to_its_minimum():
 
 SIZE = 14.0**0.5
 """Norm of the weights."""
+
+
+@pytest.mark.parametrize("size", [1.0, 5.0, 20.0])
+def test_a_simplex_of_one_weight_ends_in_a_minimum(size):
+    weight = torch.zeros(1, dtype=torch.float64)
+
+    def cost():
+        return (weight - 1.0).square().sum() + 0.3 * torch.sin(12.0 * weight).sum()
+
+    lowest = by_simplex([weight], cost, 40, size=size)
+    for step in (-1e-3, 1e-3):
+        weight += step
+        assert cost().item() > lowest
+        weight -= step
 
 
 def slopes_and_costs(slopes, costs):

@@ -57,7 +57,7 @@ def by_simplex(weights: list[nn.Parameter], cost: Callable[[], Tensor], count: i
     options = {
         "maxfev": count * len(start),
         "initial_simplex": simplex,
-        "adaptive": True,
+        "adaptive": len(start) > 1,  # which shrinks a simplex of one weight to a point
         "xatol": 1e-6,
         "fatol": 1e-12,
     }
