@@ -1,5 +1,6 @@
 """Identification from a log: derivatives against backpropagation, fits against regression, recipes around logs."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
-from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors
+from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors, with_biases
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
@@ -161,7 +162,32 @@ def test_instability_is_sought_where_the_record_is_and_not_where_a_replay_comes_
     twin = DigitalTwin(plant, Joints(torch.tensor([0.5, 1.0, 2.0, 2.0])))
     fallen = twin.replay(states[:1], record.exogenous[None], record.actions[None]).states[0, -1]
     assert (fallen[:2].cos() < -0.9).all()
-    assert Estimation(twin, sensors).unstable([sensor_record(plant, sensors, record)]) is unstable
+    read = sensor_record(plant, sensors, record)
+    dead = torch.where(
+        torch.tensor([True, True, True, False]), read.readings, torch.nan
+    )  # which other records need not be
+    assert Estimation(twin, sensors).unstable([read._replace(readings=dead), read]) is unstable
+
+
+@pytest.mark.parametrize(("noise", "bias"), [(None, 0.5), (0.01, 2.0)])
+def test_a_bias_of_many_times_the_noise_is_found_and_held_out_readings_have_it_too(noise, bias):
+    plant, generator = LinearQuadratic(horizon=20.0), torch.Generator().manual_seed(0)
+    command = 4.0 * torch.rand(3, plant.n_steps, 1, generator=generator, dtype=torch.float64) - 2.0
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure)(
+            plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator), command
+        )
+    shift = 0.01 * torch.randn(flown.states.shape, generator=generator, dtype=torch.float64)
+    sensors = with_biases(sensors_of(plant, ["position", "velocity"]), ["velocity"])
+    sensors = [dataclasses.replace(sensor, noise=noise) for sensor in sensors]
+    shift[:2, :, 1] += bias
+    shift[2, :, 1] -= bias  # of another sensor
+    records = sensor_records(plant, sensors, flown._replace(states=flown.states + shift))
+    task = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors, config=EstimationConfig(segment=0))
+    found = identify(task, records[:2], records[2:])
+    assert found.estimate.biases == pytest.approx({"position": 0.0, "velocity": bias}, abs=0.003)
+    assert found.training[1].rms.tolist() == pytest.approx([0.01, 0.01], rel=0.2)
+    assert found.held_out[1].rms.tolist() == pytest.approx([0.01, 2.0 * bias], rel=0.2)
 
 
 def test_of_segments_that_are_followed_alike_the_longest_stay():

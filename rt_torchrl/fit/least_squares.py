@@ -363,10 +363,10 @@ class Estimation:
         whole record would leave it, and may come to rest elsewhere. States are measured by their usual sizes, see
         :func:`usual_sizes`.
         """
-        free = Estimation(self.twin, self.sensors)
+        free, noise = Estimation(self.twin, self.sensors), first_noise(self.sensors, records)
         for record in records:
             parts = segments(record, max(len(record.actions) // SHORT, 2), self.twin.plant.dt)
-            likelihood = free.likelihood(parts, weights=False)
+            likelihood = free.likelihood(parts, noise, weights=False, biases=torch.zeros_like(noise))
             size, ends = likelihood.initial.unit.sum(-1), dict[int, Tensor]()
             try:
                 for replay in likelihood.replays():
@@ -388,6 +388,7 @@ class Estimation:
         prior: WeightPrior | None = None,
         weights: bool = True,
         known: bool = False,
+        biases: Float[Tensor, " n_y"] | None = None,
     ) -> Likelihood:
         """The likelihood of records, with initial states at their guess.
 
@@ -396,13 +397,17 @@ class Estimation:
             noise: noise levels; by default those that are given, and a share of the readings' scatter for others.
             prior: prior of the weights.
             weights: whether the weights are unknowns.
-            known: whether to take the initial states as known.
+            known: whether to take the initial states as known, and biases as zero.
+            biases: known biases; None lets those that are wanted be unknowns.
         """
         noise = first_noise(self.sensors, records) if noise is None else noise
         first = torch.stack([record.guess for record in records])
         free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
         sizes = usual_sizes(self.twin.plant, first, self.sensors, records) if free else torch.ones_like(first[0])
-        biased = [k for k, sensor in enumerate(self.sensors) if sensor.bias]
+        unknown = biases is None and not known
+        biased = [k for k, sensor in enumerate(self.sensors) if sensor.bias and unknown]
+        # A bias may be many times the noise, and a step changes it by a unit at most.
+        unit = torch.maximum(noise, FIRST_NOISE * scatter_of(self.sensors, records)) if biased else noise
         return Likelihood(
             self.twin,
             records,
@@ -410,14 +415,23 @@ class Estimation:
             Offsets(first, free, sizes),
             noise,
             spread=self.spread.to(first.device),
-            biases=None if known else Offsets(torch.zeros_like(noise), biased, noise),
+            biases=Offsets(torch.zeros_like(noise) if biases is None else biases, biased, unit),
             prior=prior,
             weights=weights,
         )
 
-    def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
-        """The likelihood of other records under the present weights, at the initial states that suit them best."""
-        likelihood = self.likelihood(records, noise, weights=False)
+    def fit_initial_states(
+        self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"], biases: Float[Tensor, " n_y"] | None = None
+    ) -> Likelihood:
+        """The likelihood of other records under the present weights, at the initial states that suit them best.
+
+        Args:
+            records: the records.
+            noise: noise levels.
+            biases: biases of the sensors; None for none.
+        """
+        biases = torch.zeros_like(noise) if biases is None else biases
+        likelihood = self.likelihood(records, noise, weights=False, biases=biases)
         method = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
         method.run(likelihood.normal_equations, INITIAL_ITERATIONS)
         return likelihood
@@ -496,7 +510,7 @@ def usual_sizes(
             values = torch.cat([record.readings[:, column] for record in records])
             values = values[~values.isnan()]
             scatter = (values - values.mean()).square().mean().sqrt()
-            sizes[k] = torch.maximum(sizes[k], scatter)
+            sizes[k] = torch.fmax(sizes[k], scatter)  # of a sensor without samples there is none
     return torch.where(sizes > 0.0, sizes, 1.0)
 
 
@@ -531,11 +545,12 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
     closure, dt = estimation.twin.closure, estimation.twin.plant.dt
     start = copy.deepcopy(closure.state_dict())
     estimate = estimation.run(training)
-    noise, length, trained = estimate.likelihood.noise, estimate.segment, copy.deepcopy(closure.state_dict())
+    length, trained = estimate.segment, copy.deepcopy(closure.state_dict())
+    noise, biases = estimate.likelihood.noise, estimate.likelihood.biases().detach()
     sides = [estimate.likelihood.records, list(held_out)]
     if length:
         sides[1] = [part for record in held_out for part in segments(record, length, dt)]
-    after = [judged(estimate.likelihood), judged(estimation.fit_initial_states(sides[1], noise))]
+    after = [judged(estimate.likelihood), judged(estimation.fit_initial_states(sides[1], noise, biases))]
     closure.load_state_dict(start)
     first = first_noise(estimation.sensors, training)
     before = [judged(estimation.fit_initial_states(records, first)) for records in sides]
