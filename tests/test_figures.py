@@ -366,6 +366,8 @@ def test_heat_exchanger_of_each_closure(tank):
 
 def test_closure_weights_with_truth_start_and_units(tank):
     figure = closure_weights(tank)
+    low, high = figure.axes[0].get_xlim()
+    assert low < 1 and high > len(tank.episodes)
     for ax, (name, found) in zip(figure.axes, FOUND.items(), strict=True):
         assert list(line(ax, "twin").get_ydata()) == found
         assert line(ax, "true").get_ydata()[0] == pytest.approx(TRUE[name], rel=1e-14)

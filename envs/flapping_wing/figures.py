@@ -188,7 +188,7 @@ def _coefficients(snapshot: Snapshot) -> list[str]:
 def control_surfaces(snapshot: Snapshot) -> Figure:
     """Both actions over the errors of x and of z and their rates; other observations are zero (paper, fig. 18)."""
     count = len(snapshot.plant.actions)
-    title = f"Policies after episode {style.last_episode(snapshot)}\nobservations that are not shown are zero"
+    title = f"Policies after episode {len(snapshot.episodes)}\nobservations that are not shown are zero"
     figure, axes = style.panels(2, 2 * count, title=title, size=(16.0, 6.8))
     zero = torch.zeros(len(snapshot.plant.observations), dtype=torch.float64, device=snapshot.record.states.device)
     for k in range(count):

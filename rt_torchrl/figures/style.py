@@ -239,14 +239,9 @@ def closures(snapshot: Snapshot) -> dict[str, nn.Module]:
     return dict(zip(CLOSURE_LINES, (true, snapshot.closure, snapshot.initial_closure), strict=True))
 
 
-def last_episode(snapshot: Snapshot) -> int:
-    """Number of the training's last episode, from 0 as in ``metrics.json``."""
-    return max(len(snapshot.episodes) - 1, 0)
-
-
 def episode(snapshot: Snapshot) -> str:
     """What a title calls the record."""
-    return snapshot.simulated or f"episode {last_episode(snapshot)}"
+    return snapshot.simulated or f"episode {len(snapshot.episodes)}"
 
 
 def record_label(snapshot: Snapshot) -> str:

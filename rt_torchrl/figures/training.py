@@ -176,7 +176,7 @@ def closure_weights(snapshot: Snapshot) -> Figure:
         label = _label(name, described.get(name, {}))
         caption(ax, label, f"{100.0 * (values[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes[0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
+    axes[0].set_xlim(0.5, len(snapshot.episodes) + 0.5)
     legend_below(figure, axes)
     return figure
 
@@ -249,7 +249,7 @@ def _curves(snapshot: Snapshot) -> Figure:
     axis = _axis(plant.observations[0], torch.cat([observations[:, 0], -observations[:, 0]]))
     figure, axes = style.grid(
         len(plant.actions),
-        title=f"Policies after episode {style.last_episode(snapshot)}",
+        title=f"Policies after episode {len(snapshot.episodes)}",
         size=(6.5, 1.2 + 2.4 * len(plant.actions)),
         xlabel=plant.observations[0].label,
     )
@@ -275,7 +275,7 @@ def _contours(snapshot: Snapshot) -> Figure:
     figure, axes = style.panels(
         rows,
         2,
-        title=f"Policies after episode {style.last_episode(snapshot)}{others}",
+        title=f"Policies after episode {len(snapshot.episodes)}{others}",
         size=(9.5, 1.0 + 2.9 * rows),
         sharex=True,
         sharey=True,
