@@ -246,16 +246,20 @@ def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_p
     assert "does not fly the real system: model_" in said and "next: judge the live policy" not in said
 
 
-def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_training(tmp_path, capsys):
-    rig = machine()
+@pytest.mark.parametrize(
+    "cause", ["the environment terminated the episode after 5 of 20", "ConnectionError: no answer"]
+)
+def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_training(tmp_path, capsys, cause):
+    rig = Judged(LinearQuadratic(horizon=2.0))
 
     def fail(episodes):
-        rig.ends_after, rig.terminates = (5, True) if len(episodes) == 2 else (None, False)
+        if len(episodes) == 2:
+            rig.ends_after, rig.terminates, rig.fails_at = 5, True, 4 if "answer" in cause else None
 
     metrics = run_on(rig, tmp_path, real_unseen=2, baselines={"PD": PD}, callbacks=[fail]).train()
     assert len(metrics["episodes"]) == 2 and "real_unseen" not in metrics["summary"]
     said = capsys.readouterr().out
-    assert "PD is not judged on the real system: the environment terminated the episode after 5 of 20" in said
+    assert f"PD is not judged on the real system: the system failed in interval 4, at 0.4 s: {cause}" in said
 
 
 def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):

@@ -269,7 +269,7 @@ class RealEpisodes(UnseenEpisodes):
         An episode with a reading that a safety layer refuses is flown again: its cost would be that of another reading.
 
         Raises:
-            ValueError: if the system ends an episode, or several in a row have such readings.
+            ValueError: if the system fails or ends an episode, or several in a row have such readings.
         """
         if isinstance(policy, RealController):
             return policy.fly_real(self._count, seed=UNSEEN_SEED)
@@ -283,11 +283,16 @@ class RealEpisodes(UnseenEpisodes):
 
     def _flight(self, policy: nn.Module) -> "TensorDictBase":
         """An episode in which all readings are right."""
+        from rt_torchrl.systems.collectors import fly
         from rt_torchrl.systems.sound_part import FLIGHTS, report_of, sound_part, tried_in_vain
 
         refused = list[str]()
         while len(refused) < FLIGHTS:
-            episode = self._system.rollout(self.plant.n_steps, self._actor(policy))[0]
+            actor = self._actor(policy)
+            rows, why = fly(self._system, self._system.reset, lambda k, row, actor=actor: actor(row), self.plant)
+            if why is not None:
+                raise ValueError(why)
+            episode = torch.cat(rows)
             sound = sound_part(episode, self.plant, report_of(self._system))
             if sound.whole:
                 return episode

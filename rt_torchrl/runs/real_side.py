@@ -179,8 +179,10 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
 
 
 def _same_episodes(flown: Trajectory, other: Trajectory) -> bool:
-    starts = flown.states[:, 0], other.states[:, 0]
-    return torch.equal(*starts) and torch.equal(flown.exogenous, other.exogenous)
+    """Whether starts are the same, and inputs where both move: nothing is read after an early end."""
+    moves = [flight.states.diff(dim=1).any(-1).flip(1).cummax(1).values.flip(1) for flight in (flown, other)]
+    differs = (flown.exogenous != other.exogenous).any(-1) & moves[0] & moves[1]
+    return torch.equal(flown.states[:, 0], other.states[:, 0]) and not differs.any()
 
 
 def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
