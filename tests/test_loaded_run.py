@@ -226,13 +226,18 @@ class Worn(RunConfig):
         return lambda episode: LinearClosure(0.9**episode * weights)
 
 
-@pytest.mark.parametrize("start", ["random", "controller"])
+@pytest.mark.parametrize("start", ["random", "controller", "earlier"])
 def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start, monkeypatch):
-    """The flight of the controller and a refused one wear the system, too; episodes that were not made do not."""
-    parts = {"first": PD, "callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
-    run = small_run(tmp_path, 5, config=Worn, parts=parts, start=start)
+    """The flight that is imitated and a refused one wear the system, too; episodes that were not made do not."""
+    options, parts = {"start": start}, {"callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
+    if start == "controller":
+        parts["first"] = PD
+    if start == "earlier":
+        small_run(tmp_path / start, 1, config=Worn).train()
+        options = {"start": str(tmp_path / start), "policy": "mlp", "hidden": (4,)}
+    run = small_run(tmp_path, 5, config=Worn, parts=parts, **options)
     refused = SoundPart([], [], "refused by the test", whole=False)
-    answers = [*(start == "controller") * [None], None, refused, None]
+    answers = [*(start != "random") * [None], None, refused, None]
     monkeypatch.setattr(interact, "sound_part", lambda *given: answers.pop(0) or sound_part(*given))
     assert run.train()["episodes"][-1]["episodes_refused"] == 1 and not answers
     found = load_run(tmp_path, Worn, plant=LinearQuadratic(horizon=2.0)).true_closure()

@@ -132,6 +132,9 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     assert [sorted(row.costs) for row in found.rows] == [[0, 1, 2]] * 2 and found.title == "tanks"
     seeing = leave(tmp_path / "seeing", seed=0, costs=[1.0, 1.0], observe=["measured"])
     other = leave(tmp_path / "other", seed=0, costs=[7.0, 7.0], valve=6.0, task="engineering")
+    metrics = json.loads((seeing / "metrics.json").read_text())
+    metrics["summary"]["unseen"]["merit"]["model_based"]["level outside [%]"] = {"mean": 3.0}  # with limits of states
+    (seeing / "metrics.json").write_text(json.dumps(metrics))
     found = compare_runs([first[0], seeing, other])
     assert [len(group) for group in found.tasks()] == [2, 1]  # what a policy sees changes no task
     drawn = leave(tmp_path / "drawn", seed=9, costs=[1.0, 1.0], figures=False, threads=2)
@@ -141,6 +144,9 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
     assert numbers["rows"][names[1]]["J_a_ratio"]["ratio"] == 1.0 and numbers["rows"][names[2]]["J_a_ratio"] is None
     assert len(comparison_figure([found], "t").axes) == 2
+    for folders in ([first[0], seeing], [seeing, first[0]]):
+        *_, heading, _, one, two, _ = compare_runs(folders).table().splitlines()
+        assert "level outside [%]" in heading and sorted(row.split("|")[3].strip() for row in (one, two)) == ["", "3"]
 
 
 def test_runs_that_cannot_be_compared_are_refused(tmp_path):

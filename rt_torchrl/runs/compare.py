@@ -250,8 +250,12 @@ class Comparison:
         header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "seconds"]
         kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
         tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
-        if quantities := list(self.rows[0].runs[0].merit):
-            rows = [[name, *(f"{merit[quantity]:.4g}" for quantity in quantities)] for name, merit in merits.items()]
+        # Runs with limits of states have some that others have not.
+        if quantities := list(dict.fromkeys(quantity for merit in merits.values() for quantity in merit)):
+            rows = [
+                [name, *(f"{merit[quantity]:.4g}" if quantity in merit else "" for quantity in quantities)]
+                for name, merit in merits.items()
+            ]
             tables.append(markdown(["", *quantities], rows))
         return "\n\n".join(tables)
 

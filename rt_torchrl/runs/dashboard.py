@@ -104,7 +104,7 @@ def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     where = " on the twin" if on_the_twin(unseen) else ""
     costs = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in ROLES}
     costs[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
-    costs |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    costs |= {f"J_a {name}{where}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
     flown = summary.get("real_unseen", {}).get("controllers", {})
     costs |= {f"J_a {name} on the real system": entry["J_a"]["mean"] for name, entry in flown.items()}
     costs |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
