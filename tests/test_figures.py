@@ -184,6 +184,7 @@ def test_learning_curves_and_timeline(oscillator):
     ]
     assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
     assert spans == [[(0.5, 1.5), (1.5, 2.5)], [(2.5, 3.5), (3.5, 4.5)]]
+    assert "Policies after episode 4" in str(draw(figures.policy_contours(replace(oscillator, episodes=episodes))))
     assert draw(figure) and not collisions(figure)
 
 

@@ -12,11 +12,13 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import FULL, IDLE
 from test_algorithm import flown, twinning
 from test_classical import PD
+from test_early_ends import STRONG, WEAK, Falling
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl import PlantEnv, Reading, RealSystem, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
+from rt_torchrl.runs.real_side import entries
 
 STEPS = 20
 
@@ -143,6 +145,19 @@ class Asked(RealController):
 def test_judged_policies_keep_the_range_as_in_a_training():
     flown = RealEpisodes(connected(LinearQuadratic(horizon=2.0)), 2).fly(LinearGain([[8.0, 4.0]]))
     assert flown.actions.abs().max() == 2.0
+
+
+def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
+    plant = Falling()
+    episodes = RealEpisodes(connected(plant), 3)
+    flights = {name: episodes.fly(LinearGain(gain)) for name, gain in (("live", STRONG), ("weak", WEAK))}
+    assert plant.ended(flights["weak"].states).any(1).all() and not plant.ended(flights["live"].states).any()
+    judged = {name: episodes.judge(flown) for name, flown in flights.items()}
+    costs, others = (judged[name].control_costs for name in ("live", "weak"))
+    found = entries(flights, judged, "live")["controllers"]["weak"]
+    assert (found["ratio"], found["cheaper"]) == (pytest.approx((costs.mean() / others.mean()).item()), 3)
+    flights["weak"] = flights["weak"]._replace(exogenous=flights["weak"].exogenous + 1e-9)  # of other episodes
+    assert "ratio" not in entries(flights, judged, "live")["controllers"]["weak"]
 
 
 def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
