@@ -10,8 +10,8 @@ import pytest
 import scipy.linalg
 import torch
 from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
 from tensordict import TensorDict
-from test_run import SMALL
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs

@@ -10,6 +10,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import FULL, SMALL, believing, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
+from test_early_ends import Falling
 from test_hypotheses import LAG, Suspecting
 from torchrl.collectors import Collector
 
@@ -22,6 +23,7 @@ from rt_torchrl import (
     Snapshot,
     identification_cost,
 )
+from rt_torchrl import figures as drawings
 from rt_torchrl.figures import style
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
@@ -81,6 +83,28 @@ class Worn(RunConfig):
     def wear(self, plant):
         worn = LinearClosure(torch.zeros(2, 2))
         return lambda episode: plant.closure if episode < 1 else worn
+
+
+def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
+    """Nothing moves after an early end, whatever a policy asks for."""
+    shown, draw, plant = {}, drawings.flights, Falling()
+
+    def kept(physics, flown, **options):
+        shown.update(flown)
+        return draw(physics, flown, **options)
+
+    monkeypatch.setattr(drawings, "flights", kept)
+    parts = {
+        "callbacks": [
+            lambda episodes: [policy.gain.data.zero_() for policy in run.algorithm.policies.values()] and None
+        ]
+    }
+    run = small_run(tmp_path, 1, plant, figures=True, parts=parts)
+    run.train()
+    (flown,) = shown.values()
+    assert len(flown.actions) < plant.n_steps and plant.ended(flown.states).tolist() == [False] * len(flown.actions) + [
+        True
+    ]
 
 
 def test_the_twin_follows_a_system_that_wears(tmp_path):

@@ -283,21 +283,26 @@ class RealEpisodes(UnseenEpisodes):
 
     def _flight(self, policy: nn.Module) -> "TensorDictBase":
         """An episode in which all readings are right."""
-        from rt_torchrl.systems.collectors import fly
         from rt_torchrl.systems.sound_part import FLIGHTS, report_of, sound_part, tried_in_vain
 
         refused = list[str]()
         while len(refused) < FLIGHTS:
-            actor = self._actor(policy)
-            rows, why = fly(self._system, self._system.reset, lambda k, row, actor=actor: actor(row), self.plant)
-            if why is not None:
-                raise ValueError(why)
-            episode = torch.cat(rows)
+            episode = self._attempt(policy)
             sound = sound_part(episode, self.plant, report_of(self._system))
             if sound.whole:
                 return episode
             refused.append(sound.reason)
         raise ValueError(tried_in_vain(refused))
+
+    def _attempt(self, policy: nn.Module) -> "TensorDictBase":
+        """An episode."""
+        from rt_torchrl.systems.collectors import fly
+
+        actor = self._actor(policy)
+        rows, why = fly(self._system, self._system.reset, lambda k, row: actor(row), self.plant)
+        if why is not None:
+            raise ValueError(why)
+        return torch.cat(rows)
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""

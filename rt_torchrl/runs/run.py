@@ -36,7 +36,7 @@ from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.operation import Operation
 from rt_torchrl.systems.preflight import check_record
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 
 
 class Run:
@@ -360,7 +360,8 @@ class Run:
     def _drawn(self, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged]) -> dict[str, np.ndarray]:
         """Draw the figures of the training and of the unseen episodes, into ``figures/``; their pixels by name."""
         live, where = self.algorithm.referee.live, "on the twin" if self.unseen.judged_on == "twin" else ""
-        trajectories = {who: flown.each()[0] for who, flown in flights.items() if who == live or who not in ROLES}
+        shown = {who: flown.each()[0] for who, flown in flights.items() if who == live or who not in ROLES}
+        trajectories = {who: until_end(self.unseen.flying, flown) for who, flown in shown.items()}
         snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
         drawn = {**figures.figures_of(snapshot), **self.config.plant_figures(snapshot)}
         drawn["flights"] = figures.flights(self.unseen.physics, trajectories, where=where)
