@@ -167,15 +167,17 @@ def test_instability_is_sought_where_the_record_is_and_not_where_a_replay_comes_
     assert Estimation(twin, sensors).unstable([read._replace(readings=dead), read]) is unstable
 
 
-@pytest.mark.parametrize(("noise", "bias", "held_out"), [(None, 0.5, -0.5), (0.01, 2.0, 2.0)])
-def test_a_bias_of_many_times_the_noise_is_found_and_held_out_readings_have_it_too(noise, bias, held_out):
+@pytest.mark.parametrize(
+    ("noise", "bias", "held_out", "size"), [(None, 0.5, -0.5, 1.0), (0.01, 2.0, 2.0, 1.0), (None, 0.5, 0.5, 0.01)]
+)
+def test_a_bias_of_many_times_the_noise_is_found_and_held_out_readings_have_it_too(noise, bias, held_out, size):
+    """Also one that is far more than the readings move, as in a system that is held."""
     plant, generator = LinearQuadratic(horizon=20.0), torch.Generator().manual_seed(0)
     command = 4.0 * torch.rand(3, plant.n_steps, 1, generator=generator, dtype=torch.float64) - 2.0
+    episodes = plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator), command
     with torch.no_grad():
-        flown = Rollout(plant, plant.closure)(
-            plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator), command
-        )
-    shift = 0.01 * torch.randn(flown.states.shape, generator=generator, dtype=torch.float64)
+        flown = Rollout(plant, plant.closure)(*(size * part for part in episodes))
+    shift = 0.01 * size * torch.randn(flown.states.shape, generator=generator, dtype=torch.float64)
     sensors = with_biases(sensors_of(plant, ["position", "velocity"]), ["velocity"])
     sensors = [dataclasses.replace(sensor, noise=noise) for sensor in sensors]
     shift[:2, :, 1] += bias
@@ -183,9 +185,9 @@ def test_a_bias_of_many_times_the_noise_is_found_and_held_out_readings_have_it_t
     records = sensor_records(plant, sensors, flown._replace(states=flown.states + shift))
     task = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors, config=EstimationConfig(segment=0))
     found = identify(task, records[:2], records[2:])
-    assert found.estimate.biases == pytest.approx({"position": 0.0, "velocity": bias}, abs=0.003)
-    assert found.training[1].rms.tolist() == pytest.approx([0.01, 0.01], rel=0.2)
-    assert found.held_out[1].rms[1].item() == pytest.approx(max(0.01, bias - held_out), rel=0.2)
+    assert found.estimate.biases == pytest.approx({"position": 0.0, "velocity": bias}, abs=0.003 * size)
+    assert found.training[1].rms.tolist() == pytest.approx([0.01 * size] * 2, rel=0.2)
+    assert found.held_out[1].rms[1].item() == pytest.approx(max(0.01 * size, bias - held_out), rel=0.2)
 
 
 def test_of_segments_that_are_followed_alike_the_longest_stay():

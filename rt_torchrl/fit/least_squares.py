@@ -406,8 +406,9 @@ class Estimation:
         sizes = usual_sizes(self.twin.plant, first, self.sensors, records) if free else torch.ones_like(first[0])
         unknown = biases is None and not known
         biased = [k for k, sensor in enumerate(self.sensors) if sensor.bias and unknown]
-        # A bias may be many times the noise, and a step changes it by a unit at most.
-        unit = torch.maximum(noise, FIRST_NOISE * scatter_of(self.sensors, records)) if biased else noise
+        # A bias may be far more than noise and scatter, and a step changes it by a unit at most.
+        largest = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
+        unit = torch.maximum(noise, FIRST_NOISE * largest)
         return Likelihood(
             self.twin,
             records,
