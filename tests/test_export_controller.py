@@ -7,12 +7,13 @@ import re
 import pytest
 import torch
 from c_build import library, needs_compiler
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import seeded
 
 from rt_torchrl import Rollout, SaturatedAffine, Signal, export_controller, export_twin, shipped_plants
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export import c_file
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.programs.c_source import CSource
@@ -235,6 +236,20 @@ def build(path):
         return torch.tensor(list(arrays[0]), dtype=torch.float64)
 
     return run
+
+
+@needs_compiler
+def test_flights_that_run_away_hide_no_difference_in_others(tmp_path, monkeypatch):
+    closure, answers = LinearClosure([[0.0, 0.0], [0.0, 60.0]]), c_file.answers  # e^120 after 20 intervals
+
+    def wrong(*arguments):
+        values = answers(*arguments)
+        values[0] *= 1.001
+        return values
+
+    monkeypatch.setattr(c_file, "answers", wrong)
+    with pytest.raises(ValueError, match="twin_step in C"):
+        export_twin(closure, tmp_path / "twin.c", LinearQuadratic(), name="twin")
 
 
 @needs_compiler

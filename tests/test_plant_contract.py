@@ -244,9 +244,12 @@ def test_a_sound_plant_is_told_what_was_checked():
     assert found.plant == "linear_quadratic"
     assert re.fullmatch(
         r"plant 'linear_quadratic' fulfils its contract: signals, draws, .*gradients.*, on 4 flights of 10 intervals "
-        r"of 0.1 s",
+        r"of 0.1 s; a step errs by .* % of its move",
         str(found),
     )
+    # The step is of fourth order: twice as many err by a sixteenth, and by that of a move of half the length.
+    finer = check_plant(LinearQuadratic(dt=0.05), steps=10, traced=False)
+    assert found.step_error / finer.step_error == pytest.approx(16.0, rel=0.15)
 
 
 def test_a_plant_without_chance_is_sound():

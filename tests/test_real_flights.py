@@ -155,7 +155,7 @@ def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
     judged = {name: episodes.judge(flown) for name, flown in flights.items()}
     costs, others = (judged[name].control_costs for name in ("live", "weak"))
     found = entries(flights, judged, "live")["controllers"]["weak"]
-    assert (found["ratio"], found["cheaper"]) == (pytest.approx((costs.mean() / others.mean()).item()), 3)
+    assert found["ratio"]["mean"] == pytest.approx((costs.mean() / others.mean()).item()) and found["cheaper"] == 3
     flights["weak"] = flights["weak"]._replace(exogenous=flights["weak"].exogenous + 1e-9)  # of other episodes
     assert "ratio" not in entries(flights, judged, "live")["controllers"]["weak"]
 
@@ -178,8 +178,12 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     costs, flown = summary["real_unseen"]["costs"], summary["real_unseen"]["controllers"]
     assert [*costs] == [live, "cascade", "PD"]
     assert "ratio" not in flown[live] and flown["PD"]["cheaper"] == sum(map(operator.lt, costs[live], costs["PD"]))
-    assert flown["PD"]["ratio"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
-    assert f"the live policy costs {flown['PD']['ratio']:.4g} of it, cheaper in {flown['PD']['cheaper']} of 2" in said
+    ratio, pairs = flown["PD"]["ratio"], [live / other for live, other in zip(costs[live], costs["PD"], strict=True)]
+    assert ratio["mean"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
+    assert ratio["confidence_interval"] == pytest.approx(sorted(pairs), rel=1e-9)
+    interval = f"[{min(pairs):.4g}, {max(pairs):.4g}]"
+    words_of_both = f"{ratio['mean']:.4g} {interval} of it, cheaper in {flown['PD']['cheaper']} of 2"
+    assert f"the live policy costs {words_of_both}" in said
     assert [cost for each in costs.values() for cost in each] == pytest.approx(rig.costs[3:], rel=1e-9)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     policy = run.algorithm.policies[live]

@@ -113,6 +113,12 @@ def test_it_shows_the_step_and_the_costs_of_the_last_episode(monkeypatch, capsys
     assert "assimilating" in shown and "1/3" in shown and "real 0.25, live model-free; drawing figures" in shown
 
 
+def test_it_says_why_no_policy_may_act(capsys):
+    with Progress(2) as bar:
+        bar.episode({"episode": 1, "real_cost": 0.25, "live": "first", "reason": "model_based may not act: it is dear"})
+    assert "episode 1: model_based may not act: it is dear" in capsys.readouterr().out
+
+
 def test_a_log_has_a_line_for_each_episode_and_for_what_begins_after_a_while(monkeypatch, capsys):
     with Progress(3) as bar:
         bar.doing("checking the gradient")

@@ -13,6 +13,7 @@ from rt_torchrl.contract.gradients_and_tracing import (
     gradients,
     jacobians,
     stability,
+    step_error,
     untraceable,
 )
 from rt_torchrl.contract.methods import Calls, costs, ends, judgement, method, module_methods, periods
@@ -43,6 +44,8 @@ class ContractReport(NamedTuple):
         episodes: number of flights.
         steps: number of control intervals of each flight.
         dt: control interval [s].
+        step_error: what a Runge-Kutta step leaves of the greatest move of a state in one, against two half steps; None
+            for a plant with a scheme of its own.
         untraceable: what keeps the engine ``native`` from the plant, whose place ``autograd`` then takes; None if
             nothing does, or if the methods were not traced.
     """
@@ -52,13 +55,15 @@ class ContractReport(NamedTuple):
     episodes: int
     steps: int
     dt: float
+    step_error: float | None = None
     untraceable: str | None = None
 
     def __str__(self) -> str:
+        accuracy = "" if self.step_error is None else f"; a step errs by {100 * self.step_error:.1g} % of its move"
         engine = f"; engine 'autograd' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
         return (
             f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}, on {self.episodes} flights of "
-            f"{self.steps} intervals of {self.dt:g} s{engine}"
+            f"{self.steps} intervals of {self.dt:g} s{accuracy}{engine}"
         )
 
 
@@ -110,8 +115,9 @@ def check_plant(
     violations = violations or _on_flights(plant, episodes, steps, seed, trained=trained)
     if violations:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), violations)
-    reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
-    return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, reason)
+    calls = Calls.at_the_start(plant, episodes, seed)
+    reason = untraceable(calls) if traced else None
+    return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, step_error(calls), reason)
 
 
 def _on_cpu(plant: Plant) -> Plant:

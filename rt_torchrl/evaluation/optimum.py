@@ -1,6 +1,8 @@
 """The best policy of a class on the true plant."""
 
+import contextlib
 import copy
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,6 +12,7 @@ from torch import Tensor, nn
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.simplex import by_simplex, searched
+from rt_torchrl.trajectories.rollout import DivergenceError
 
 SMALL_STEPS = tuple(DescentConfig(rate=rate, gradient_limit=0.1) for rate in (0.02, 0.005))
 """Adam's options, beside β₂ = 0.99, of the two halves of an approach."""
@@ -64,6 +67,9 @@ def exact_optimum(
         approach: gradients of Adam from each start before those of L-BFGS; by default none, or 600 where weights
             are many. L-BFGS alone takes perceptrons to the next poor minimum.
         seed: seed of the initial weights.
+
+    Raises:
+        DivergenceError: if the plant diverges under every initial policy.
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
@@ -73,9 +79,11 @@ def exact_optimum(
 
     def descend(policy: nn.Module, count: int, steps: int, *, approaching: int = 0) -> float:
         cost = cost_of(policy, count)
-        for config in SMALL_STEPS if approaching else ():
-            Descent(policy, config, second_moment=0.99).run(cost, approaching // 2)
-        return Descent(policy, TO_THE_END).run(cost, steps).best
+        with contextlib.suppress(FloatingPointError):  # the plant diverges at this start, and may not at others
+            for config in SMALL_STEPS if approaching else ():
+                Descent(policy, config, second_moment=0.99).run(cost, approaching // 2)
+            return Descent(policy, TO_THE_END).run(cost, steps).best
+        return math.inf
 
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
     trained = [weight for weight in policies[0].parameters() if weight.requires_grad]
@@ -84,7 +92,10 @@ def exact_optimum(
     requested = {"approach": approach, "iterations": iterations, "polish": polish}
     effort = {name: usual[name] if number is None else number for name, number in requested.items()}
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
-    best, *others = (policies[k] for k in sorted(range(starts), key=costs.__getitem__))
+    sound = [k for k in sorted(range(starts), key=costs.__getitem__) if math.isfinite(costs[k])]
+    if not sound:
+        raise DivergenceError(f"plant {unseen.plant.name!r} diverges under each of the {starts} first policies.")
+    best, *others = (policies[k] for k in sound)
     by_gradients = descend(best, len(unseen.initial_state), effort["polish"])
     candidates = [(by_gradients, best)]
     if searched(best) and (all_searched or unseen.plant.end_cost is not None):

@@ -140,14 +140,14 @@ class UnseenEpisodes:
             return control_cost(self.flying, self.fly(policy))
         return self.rollout(policy).costs(self.initial_state, self.exogenous)
 
-    def validation(self) -> "UnseenEpisodes | None":
-        """Validation episodes: as many, with other draws, on the system as it is now; None if nobody knows its closure.
+    def validation(self, times: int = 1) -> "UnseenEpisodes | None":
+        """Validation episodes: so many times as many, with other draws; None if nobody knows the closure.
 
         A policy that is chosen by its cost on some episodes costs less on these than on others.
         """
         if self.closure is None:
             return None
-        count, device = self.initial_state.shape[0], self.initial_state.device
+        count, device = times * self.initial_state.shape[0], self.initial_state.device
         episodes = UnseenEpisodes(self.plant, count, device=device, seed=VALIDATION_SEED)
         episodes.closure = self.closure
         return episodes
@@ -339,17 +339,25 @@ class Judged(NamedTuple):
         return {"J_a": mean_with_confidence(self.control_costs), "merit": merit}
 
 
-def mean_with_confidence(values: Float[Tensor, " n"]) -> dict[str, Any]:
+def mean_with_confidence(values: Float[Tensor, " n"], over: Float[Tensor, " n"] | None = None) -> dict[str, Any]:
     """Mean and percentile-bootstrap 95 % confidence interval (2000 resamples), as ``metrics.json`` holds them.
 
     Of values that are not all finite, the mean and both ends of the interval are not finite either.
+
+    Args:
+        values: the values.
+        over: values of the same episodes, by whose mean the mean is divided.
     """
     from scipy.stats import bootstrap  # here, because it takes a second to load and only results need it
 
-    numbers = values.detach().cpu().numpy().astype(np.float64)
-    mean = float(numbers.mean())
-    if not np.isfinite(numbers).all() or np.ptp(numbers) == 0.0:
+    samples = [sample.detach().cpu().numpy().astype(np.float64) for sample in (values, over) if sample is not None]
+
+    def statistic(values: np.ndarray, over: np.ndarray | float = 1.0, *, axis: int = -1) -> np.ndarray:
+        return np.mean(values, axis) / np.mean(over, axis if np.ndim(over) else None)
+
+    mean = float(statistic(*samples))
+    if not np.isfinite(samples).all() or np.ptp(samples, -1).max() == 0.0:
         return {"mean": mean, "confidence_interval": [mean, mean]}
     options = {"n_resamples": 2000, "method": "percentile", "rng": np.random.default_rng(0)}
-    interval = bootstrap((numbers,), np.mean, **options).confidence_interval
+    interval = bootstrap(samples, statistic, paired=True, **options).confidence_interval
     return {"mean": mean, "confidence_interval": [float(interval.low), float(interval.high)]}

@@ -132,7 +132,7 @@ def sizes(values: Float[Tensor, "n m"]) -> Float[Tensor, " m"]:
 def require_close(
     values: Float[Tensor, "n m"],
     expected: Float[Tensor, "n m"],
-    of: Float[Tensor, " m"],
+    of: Float[Tensor, "*#n m"],
     tolerance: float,
     signals: Sequence[Signal],
     what: str,
@@ -144,7 +144,7 @@ def require_close(
     Args:
         values: values of the export.
         expected: values of what it was made of.
-        of: sizes of the signals.
+        of: sizes of the signals, perhaps of each row.
         tolerance: greatest difference that is allowed.
         signals: the signals, for the message.
         what: name of the export.

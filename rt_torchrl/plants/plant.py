@@ -62,8 +62,8 @@ class Plant(nn.Module):
     :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any choice, ``observations``
     and :meth:`observe` follow from the choice. Every method is pure and takes any leading batch dimensions; the last
     dimension is that of the signals. A method must work when it is traced, batched and differentiated: it contains no
-    clamp, detach, random number, device choice or Python branch on a tensor. :func:`rt_torchrl.check_plant` finds where
-    a subclass does not fulfil this.
+    detach, device choice or Python branch on a tensor and, beside the draws, no clamp and no random number.
+    :func:`rt_torchrl.check_plant` finds where a subclass does not fulfil this.
 
     Args:
         dt: control interval and integration step Δt [s].

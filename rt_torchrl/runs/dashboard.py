@@ -14,6 +14,7 @@ from tqdm import tqdm
 from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
 from rt_torchrl.steps.config import ROLES, Role
+from rt_torchrl.systems.operation import FIRST
 
 GROUPS = {
     "cost": ("real_cost", "start_cost", "J_a_", "ended_after"),
@@ -159,7 +160,8 @@ class Progress:
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
 
-        A line says when the twin's predictions begin or cease to be wrong, and when another twin is believed.
+        A line says when the twin's predictions begin or cease to be wrong, when another twin is believed, and why no
+        policy may act.
         """
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
@@ -167,6 +169,8 @@ class Progress:
             message = record.get("warning", "the twin's predictions hold again")
             self.write(f"episode {record['episode']}: {message}")
         self._alarm = alarm
+        if record["live"] == FIRST and "reason" in record:
+            self.write(f"episode {record['episode']}: {record['reason']}")
         believed = record.get("believed")
         if believed != self._believed:
             twin = f"the twin with {believed!r}" if believed else "the twin alone"

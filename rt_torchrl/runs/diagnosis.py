@@ -20,6 +20,8 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 
 MINIMUM, CLASS, INPUTS, MERIT = 0.03, 0.1, 0.2, 0.2
 """Shares of J_a from which a better minimum, a better controller and dearer inputs count, and share of a merit."""
+OVER = 5
+"""How many times as many episodes weights are sought on as they are judged in: the best for few fail in others."""
 JUMP, OFTEN = 0.5, 0.2
 """Change of an action from one interval to the next, as a share of its range, and share of such changes that count."""
 
@@ -56,7 +58,7 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
     policy, believed = run.policy(run.live), run.twin.believed
     unseen = UnseenEpisodes(believed.plant, episodes)
     unseen.closure, unseen.physics = believed.closure, run.physics
-    validation, flown = unseen.validation(), unseen.fly(policy)
+    validation, flown = unseen.validation(OVER), unseen.fly(policy)
     costs = unseen.judge(flown).control_costs
     assert validation is not None  # the closure of a twin is known
     best, minimum = _minimum(run, unseen, validation, costs)
@@ -118,10 +120,12 @@ def _minimum(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes,
     def drawn(generator: torch.Generator) -> torch.nn.Module:
         return run.config.make_policies(run.physics, generator)[role]
 
-    present = exact_optimum(validation, lambda generator: copy.deepcopy(policy), starts=1)
+    count = len(validation.initial_state)
+    present = exact_optimum(validation, lambda generator: copy.deepcopy(policy), starts=1, few=count)
     candidates = exact_optimum(validation, drawn), present
     best = unseen.control_costs(min(candidates, key=lambda optimum: optimum.cost).policy)
-    evidence = f"on the twin the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
+    where = f"in {len(costs)} other episodes on the twin"
+    evidence = f"{where} the policy costs {costs.mean():.4g}, and {best.mean():.4g} with the best weights found"
     # A search that ends far above the policy is poor itself, and says nothing of the plan.
     holds = None if _dearer(best, costs, MINIMUM) else _dearer(costs, best, MINIMUM)
     return min(costs, best, key=torch.mean), Reason(name, holds, evidence, remedy)
@@ -173,16 +177,19 @@ def _merits(run: LoadedRun) -> Reason:
         missing = "the plant has no merit" if others else "no classical controller flew beside the policy"
         return Reason(name, None, missing, remedy)
     cost, differences = unseen[f"J_a_{live}"]["mean"], []
-    for key, other in others.items():
-        if cost is None or other["J_a"]["mean"] is None or cost >= other["J_a"]["mean"]:
-            continue
+    costs = {key: other["J_a"]["mean"] for key, other in others.items()}
+    dearer = [key for key, its_cost in costs.items() if None not in (cost, its_cost) and cost < its_cost]
+    if not dearer:
+        return Reason(name, False, "it is cheaper than no classical controller", remedy)
+    for key in dearer:
+        other = others[key]
         for quantity, value in merit.items():
             mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
             if None not in (mean, its_mean) and abs(mean - its_mean) > MERIT * abs(its_mean):
                 differences.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
     if differences:
         return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(differences)}", remedy)
-    return Reason(name, False, "it is cheaper than no classical controller, or alike in every merit", remedy)
+    return Reason(name, False, f"it is cheaper than {', '.join(dearer)}, and alike in every merit", remedy)
 
 
 def _chattering(plant: Plant, flown: Trajectory) -> Reason:

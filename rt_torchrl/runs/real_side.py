@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
@@ -157,7 +157,7 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
     """The entry ``real_unseen`` of the summary, without J_p.
 
     Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
-    the other one, and ``cheaper`` the number of episodes in which it is cheaper.
+    the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
 
     Args:
         flights: flights by the name of the controller.
@@ -170,8 +170,7 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
         controllers[name] = {"episodes": len(costs)} | judgement.statistics()
         if name != live and live in flights and _same_episodes(flights[name], flights[live]):
             best = judged[live].control_costs
-            ratio = (best.mean() / costs.mean()).item()
-            controllers[name] |= {"ratio": ratio, "cheaper": int((best < costs).sum())}
+            controllers[name] |= {"ratio": mean_with_confidence(best, costs), "cheaper": int((best < costs).sum())}
     return {
         "controllers": controllers,
         "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},

@@ -323,9 +323,8 @@ def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
         )
         if "ratio" in entry:
             cheaper = f"cheaper in {entry['cheaper']} of {entry['episodes']}"
-            lines.append(
-                f"    on the same episodes the live policy costs {_number(entry['ratio'], '.4g')} of it, {cheaper}"
-            )
+            ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
+            lines.append(f"    on the same episodes the live policy costs {ratio} of it, {cheaper}")
         lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in entry["merit"].items()]
     return lines
 

@@ -74,7 +74,7 @@ class RunConfig:
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir, with the options of its run.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
-            unseen episodes.
+            unseen episodes and as many flights of a controller on a real system after the training.
         unseen: number of unseen episodes that twin and policies are judged on at the end, in simulation. Those of a
             real system whose closure is not known are flown on the twin alone.
         real_unseen: number of episodes that each controller flies at the end on a real system that is not simulated

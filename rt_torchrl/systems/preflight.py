@@ -255,7 +255,7 @@ def _strange_starts(plant: Plant, flown: Flown) -> Iterator[str]:
     drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
     starts = flown.states[flown.t == 0.0]
     for k, signal in enumerate(plant.states):
-        if len(starts) and _outside(drawn[:, k], starts[:, k]):
+        if len(starts) and _outside(drawn[:, k], starts[:, k], widths=0.5):
             yield (
                 f"state {signal.name} is read at the start {_beside(signal, starts[:, k], drawn[:, k])}: a wrong zero, "
                 "or other starts than those that plans are made for"
@@ -266,7 +266,7 @@ def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
     """Which inputs are read far outside what the plant draws, or at a small share of it."""
     drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
     for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
-        if _outside(course, read) or BEYOND * read.abs().max() < course.abs().min():
+        if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
             yield f"input {signal.name} is read {_beside(signal, read, course)}"
 
 
@@ -291,11 +291,11 @@ def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
     )
 
 
-def _outside(course: Tensor, read: Tensor) -> bool:
-    """Whether readings lie beyond what is drawn by more than its width."""
+def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:
+    """Whether readings lie beyond what is drawn by more than so many of its widths."""
     low, high = course.min().item(), course.max().item()
     width = high - low or max(abs(low), abs(high))
-    return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > (BEYOND - 1.0) * width
+    return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > widths * width
 
 
 def _at_first(fit: "_Fit", flown: Flown) -> list[Suspicion]:
