@@ -295,7 +295,7 @@ class RealEpisodes(UnseenEpisodes):
         raise ValueError(tried_in_vain(refused))
 
     def _attempt(self, policy: nn.Module) -> "TensorDictBase":
-        """An episode."""
+        """One episode; where the system fails, the error says in which interval."""
         from rt_torchrl.systems.collectors import fly
 
         actor = self._actor(policy)
