@@ -154,10 +154,10 @@ def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
     assert plant.ended(flights["weak"].states).any(1).all() and not plant.ended(flights["live"].states).any()
     judged = {name: episodes.judge(flown) for name, flown in flights.items()}
     costs, others = (judged[name].control_costs for name in ("live", "weak"))
-    found = entries(flights, judged, "live")["controllers"]["weak"]
+    found = entries(plant, flights, judged, "live")["controllers"]["weak"]
     assert found["ratio"]["mean"] == pytest.approx((costs.mean() / others.mean()).item()) and found["cheaper"] == 3
     flights["weak"] = flights["weak"]._replace(exogenous=flights["weak"].exogenous + 1e-9)  # of other episodes
-    assert "ratio" not in entries(flights, judged, "live")["controllers"]["weak"]
+    assert "ratio" not in entries(plant, flights, judged, "live")["controllers"]["weak"]
 
 
 def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):

@@ -17,7 +17,7 @@ from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.metrics import on_the_twin, read_metrics
-from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, plant_of, require_plant, worn_closure
+from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, read_settings, require_config
 from rt_torchrl.steps.config import Role
@@ -166,14 +166,15 @@ class LoadedRun:
 
     def true_closure(self) -> nn.Module:
         """The closure of ``plant`` at the end of the training: a system that wears is not what it was."""
-        if self.config.wear(self.plant) is None:
+        wear, episodes = self.config.wear(self.plant), self.metrics["episodes"]
+        if wear is None:
             return self.plant.closure
         # Flights that were refused wear the system, too; in an asynchronous run an episode has several windows.
-        episodes, source = self.metrics["episodes"], Path(self.config.start)
         flights = sum(entry.get("windows", 1) + entry.get("episodes_refused", 0) for entry in episodes)
-        # The policy of an earlier run flies once where policies of another architecture imitate it.
-        imitated = "start_cost" in episodes[0] and str(source) not in STARTS and source.suffix.lower() not in READERS
-        return worn_closure(self.config, self.plant, int(flights) + imitated)
+        # What is imitated has flown once before, unless its flights are those of a log.
+        flown_first = any("start_cost" in entry for entry in episodes)
+        recorded = Path(self.config.start).suffix.lower() in READERS
+        return wear(int(flights) + (flown_first and not recorded) - 1)
 
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
         """Every figure of a finished run by name, with an episode of its own; see :meth:`LoadedRun.figure`."""

@@ -25,7 +25,7 @@ from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -153,13 +153,16 @@ def announcement(names: Iterable[str], live: Role, count: int) -> str:
     return f"{count * len(called)} flights on the real system: {counts}; they count as paid"
 
 
-def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role) -> dict[str, Any]:
+def entries(
+    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
+) -> dict[str, Any]:
     """The entry ``real_unseen`` of the summary, without J_p.
 
     Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
     the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
 
     Args:
+        plant: plant of the real system.
         flights: flights by the name of the controller.
         judged: what these cost.
         live: name of the live policy, which need not have flown.
@@ -168,7 +171,7 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
     for name, judgement in judged.items():
         costs = judgement.control_costs
         controllers[name] = {"episodes": len(costs)} | judgement.statistics()
-        if name != live and live in flights and _same_episodes(flights[name], flights[live]):
+        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
             best = judged[live].control_costs
             controllers[name] |= {"ratio": mean_with_confidence(best, costs), "cheaper": int((best < costs).sum())}
     return {
@@ -177,11 +180,16 @@ def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], liv
     }
 
 
-def _same_episodes(flown: Trajectory, other: Trajectory) -> bool:
-    """Whether starts are the same, and inputs where both move: nothing is read after an early end."""
-    moves = [flight.states.diff(dim=1).any(-1).flip(1).cummax(1).values.flip(1) for flight in (flown, other)]
-    differs = (flown.exogenous != other.exogenous).any(-1) & moves[0] & moves[1]
-    return torch.equal(flown.states[:, 0], other.states[:, 0]) and not differs.any()
+def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
+    """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
+    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
+        return False
+    for flights in zip(flown.each(), other.each(), strict=True):
+        inputs = [until_end(plant, flight).exogenous for flight in flights]
+        n = min(map(len, inputs))
+        if not torch.equal(inputs[0][:n], inputs[1][:n]):
+            return False
+    return True
 
 
 def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:

@@ -326,7 +326,7 @@ class Run:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
         self._paid += [cost for judgement in judged.values() for cost in judgement.control_costs.tolist()]
-        entry = real_side.entries(flights, judged, live)
+        entry = real_side.entries(episodes.plant, flights, judged, live)
         if live in flights:
             costs = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
             entry |= {name: mean_with_confidence(cost) for name, cost in zip(("J_p", "J_p_before"), costs, strict=True)}
