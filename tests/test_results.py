@@ -82,6 +82,7 @@ ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
         ({}, None, "", ["a 1 1.5", "b 2 2.5"]),
         ({"true": {"other": 1.0}}, None, "", ["a 1 1.5", "b 2 2.5"]),
         ({"true": {"a": 1.25}}, {"a": 0.25, "b": None}, " std. error true", ["a 1 1.5 0.25 1.25", "b 2 2.5 - -"]),
+        ({}, {"a": 0.0, "b": 0.5}, " std. error", ["a 1 1.5 fixed", "b 2 2.5 0.5"]),
         ({"described": ROD}, None, "", ["a [kg] 1 1.5 mass of the rod", "b 2 2.5"]),
     ],
 )

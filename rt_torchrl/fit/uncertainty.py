@@ -102,7 +102,7 @@ class Uncertainty:
         return [name for name, free in zip(self.names, self.undetermined(self._slopes).tolist(), strict=True) if free]
 
     def standard_errors(self) -> dict[str, float]:
-        """Standard error of every named value; infinite for one of which the data say nothing."""
+        """Standard error of every named value; infinite for one of which the data say nothing, zero for a fixed one."""
         errors = self.named_covariance.diagonal().clamp_min(0.0).sqrt().tolist()
         return dict(zip(self.names, errors, strict=True)) | dict.fromkeys(self.unknown(), math.inf)
 

@@ -383,8 +383,11 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | Non
     for name in weights:
         description = closure["described"].get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{description['unit']}]" if description["unit"] else name
-        cells = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
-        lines.append(f"  {label:<22}{cells}   {description['meaning']}".rstrip())
+        cells = {column: _number(values.get(name), ".5g") for column, values in columns.items()}
+        if errors and errors.get(name) == 0.0:
+            cells["std. error"] = "fixed"
+        row = "".join(f"{cell:>12}" for cell in cells.values())
+        lines.append(f"  {label:<22}{row}   {description['meaning']}".rstrip())
     if any(error is None or math.isinf(error) for name, error in (errors or {}).items() if name in weights):
         lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
     return lines
