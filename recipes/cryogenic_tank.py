@@ -32,6 +32,7 @@ PAPER_T3 = dataclasses.replace(
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T3."""
 DEFAULT = rt.TwinningConfig(
     realisations=1,
+    records=1,
     # The pressure moves over days: the noise lasts a period of the load, returns span 17 h and the discount 42 h.
     exploration=rt.ExplorationConfig(correlation_time=5400.0),
     learner=rt.LearnerConfig(
@@ -44,11 +45,9 @@ DEFAULT = rt.TwinningConfig(
     ),
     exogenous=LOAD,
     # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
-    assimilation=rt.AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
-    # Starting pressures differ by 25 kPa: a plan for one of them does not suit the others.
+    assimilation=rt.AssimilationConfig(iterations=30),
     planner=rt.PlannerConfig(
         iterations=12,
-        realisations=20,
         descent=dataclasses.replace(LBFGS, tolerance=1e-6),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
         receding_horizon=rt.PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
@@ -59,9 +58,7 @@ DEFAULT = rt.TwinningConfig(
 NEURAL = dataclasses.replace(
     DEFAULT,
     # Segments last two hours. Without the prior the perceptron takes the first steps, which the constants should take.
-    assimilation=rt.AssimilationConfig(
-        iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
-    ),
+    assimilation=rt.AssimilationConfig(segment=240, prior=30.0),
     hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""

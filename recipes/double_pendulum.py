@@ -129,7 +129,6 @@ class Config(rt.RunConfig):
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"
-    twinning: rt.TwinningConfig = rt.FEW_COEFFICIENTS
 
     def plant(self) -> DoublePendulum:
         return DoublePendulum()

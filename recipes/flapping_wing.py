@@ -36,6 +36,7 @@ PAPER_T2 = dataclasses.replace(
 )
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T2."""
 DEFAULT = rt.TwinningConfig(
+    records=1,
     # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
     # discount one second. With a discount of 0.998 and targets of one interval the policy flies off.
     exploration=rt.ExplorationConfig(correlation_time=0.05),
@@ -49,14 +50,8 @@ DEFAULT = rt.TwinningConfig(
     ),
     # Twenty flights hardly meet the rare gusts that cost most, and a plan on those that were met is too mild.
     exogenous=dataclasses.replace(GUST, large_scale="mixed"),
-    assimilation=rt.AssimilationConfig(iterations=15, method="levenberg_marquardt"),
-    # A valley of the cost is narrow where the stroke plane tilts fast: Adam leaves 1 to 2 % there.
-    planner=rt.PlannerConfig(
-        iterations=30,
-        realisations=20,
-        descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0),
-        receding_horizon=PREDICTIVE,
-    ),
+    assimilation=rt.AssimilationConfig(inputs="realisations"),
+    planner=rt.PlannerConfig(iterations=30, receding_horizon=PREDICTIVE),
     referee=rt.RefereeConfig(patience=4, clone_patience=4),
 )
 """Configuration of the training by default."""
@@ -74,9 +69,7 @@ NEURAL = dataclasses.replace(
     DEFAULT,
     # Segments last five wing beats, 0.25 s, because over whole flights most steps fail. They use the measured wind,
     # because three hundred weights on every draw of the wind would take gigabytes.
-    assimilation=rt.AssimilationConfig(
-        iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
-    ),
+    assimilation=rt.AssimilationConfig(iterations=8, segment=500, prior=1e-6),
     hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""

@@ -12,15 +12,16 @@ if __name__ == "__main__":
 from rt_torchrl.envs.pendulum.plant import Pendulum
 
 SWING_UP = rt.TwinningConfig(
+    records=1,
     # The model-free policy finds the swing-up and plans improve it, because descents from random weights end in another
     # minimum. White noise hardly moves the rod; this one fills the torque's range and lasts about a swing.
     exploration=rt.ExplorationConfig(spread=1.0, episodes=10, correlation_time=0.3),
     # Costs reach 16; the scale keeps values at the order of ten, which a perceptron can reach.
-    learner=rt.LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
+    learner=rt.LearnerConfig(critic_iterations=500, actor_iterations=1000, reward_scale=0.1, actor_rate=1e-3),
     # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
-    assimilation=rt.AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
+    assimilation=rt.AssimilationConfig(iterations=30, segment=10),
     # Tiny changes decide whether a swing reaches the top: a plan on few episodes says little about others.
-    planner=rt.PlannerConfig(realisations=64),
+    planner=rt.PlannerConfig(iterations=10, realisations=64, descent=rt.DescentConfig()),
 )
 
 

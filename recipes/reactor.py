@@ -117,7 +117,6 @@ class Config(rt.RunConfig):
     episodes: int = 6
     real_unseen: int = 20
     start: str = "controller"
-    twinning: rt.TwinningConfig = rt.FEW_COEFFICIENTS
 
     def plant(self) -> Reactor:
         return Reactor()

@@ -27,13 +27,14 @@ LBFGS = rt.DescentConfig(optimiser="lbfgs", rate=1.0)
 PAPER_T1 = dataclasses.replace(rt.PAPER, planner=dataclasses.replace(rt.PAPER.planner, descent=LBFGS))
 """Configuration of the training with ``--preset paper``: Table 1 of the paper, row T1."""
 DEFAULT = rt.TwinningConfig(
+    records=1,
     # Targets span 5 s: an action of 0.5 s moves a rotor with a time constant of 16 s by less than the critic's error.
     # Beside a twin a hundred iterations end where the paper's 500 and 1000 end.
     learner=rt.LearnerConfig(critic_iterations=100, actor_iterations=100, return_steps=10),
     # Fits and plans converge over the episodes. The wind is the measured one, because draws of it leave an error in the
     # closure, and the plans 1 to 2 % above the optimum. While the first closures are wrong, a plan of a hundred
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
-    assimilation=rt.AssimilationConfig(iterations=60, method="lbfgs", inputs="record"),
+    assimilation=rt.AssimilationConfig(iterations=60, method="lbfgs"),
     planner=rt.PlannerConfig(
         iterations=25,
         realisations=50,
@@ -48,9 +49,7 @@ NEURAL = dataclasses.replace(
     # the rotor's time constant of 16 s, because over whole records most steps fail. One wind shows a part of (λ, β),
     # so that there are six.
     records=6,
-    assimilation=rt.AssimilationConfig(
-        iterations=10, method="levenberg_marquardt", inputs="record", segment=20, prior=0.02
-    ),
+    assimilation=rt.AssimilationConfig(iterations=10, segment=20, prior=0.02),
     hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""

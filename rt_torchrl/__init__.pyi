@@ -58,7 +58,6 @@ from .steps.learn import ActorCritic, Learner, LearningMethod
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
 from .steps.config import (
-    FEW_COEFFICIENTS,
     PAPER,
     AssimilationConfig,
     ExogenousConfig,
@@ -90,7 +89,6 @@ __version__: str
 
 __all__ = [
     "DISCON",
-    "FEW_COEFFICIENTS",
     "PAPER",
     "ActorCritic",
     "Actuation",

@@ -46,8 +46,8 @@ class LearnerConfig:
     """
 
     algorithm: LearnerName = "ddpg"
-    critic_iterations: Count = 500
-    actor_iterations: Count = 1000
+    critic_iterations: Count = 200
+    actor_iterations: Count = 200
     batch_size: AtLeastOne = 128
     discount: Annotated[float, Field(ge=0, lt=1)] = 0.98
     return_steps: AtLeastOne = 1
@@ -101,10 +101,10 @@ class PlannerConfig:
     """
 
     method: Literal["multi_start", "single_start", "receding_horizon"] = "multi_start"
-    iterations: Count = 10
-    realisations: AtLeastOne | None = None
+    iterations: Count = 40
+    realisations: AtLeastOne | None = 20
     starts: Count = 32
-    descent: DescentConfig = field(default_factory=DescentConfig)
+    descent: DescentConfig = field(default_factory=lambda: DescentConfig(optimiser="lbfgs", rate=1.0))
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
 
@@ -137,9 +137,9 @@ class AssimilationConfig:
         inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
             paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
             it also does not find weights that move the states less than that chance does.
-        method: method of the fit: ``adam`` with a rate of 0.1, ``lbfgs`` with a line search, or
-            ``levenberg_marquardt``, which solves the normal equations from forward sensitivities, for closures of some
-            ten weights.
+        method: method of the fit: ``levenberg_marquardt``, which solves the normal equations from forward
+            sensitivities, for closures of some ten weights; ``lbfgs`` with a line search; or ``adam`` with a rate of
+            0.1, as the paper's.
         prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
             perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
             keep their initial values, and so the law keeps its initial form where no record has been.
@@ -156,8 +156,8 @@ class AssimilationConfig:
 
     iterations: Count = 15
     stop_below: NotNegative = 0.0
-    inputs: Literal["realisations", "record"] = "realisations"
-    method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "adam"
+    inputs: Literal["realisations", "record"] = "record"
+    method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "levenberg_marquardt"
     prior: NotNegative = 0.0
     segment: Count | None = None
     initial: Literal["measured", "estimated"] = "measured"
@@ -197,6 +197,9 @@ class HypothesesConfig:
 class TwinningConfig:
     """Hyper-parameters of the algorithm, by step.
 
+    The defaults suit a plant with some ten unknown coefficients whose inputs are measured: step 4 solves least squares
+    over the last eight records, and step 5 descends by L-BFGS on twenty virtual episodes. :data:`PAPER` has the paper's.
+
     Args:
         arm: part of the algorithm that runs: ``twinning`` for all six steps, ``model_free`` for steps 1 and 2 alone, or
             else ``model_based`` for steps 1, 3, 4 and 5 alone.
@@ -218,7 +221,7 @@ class TwinningConfig:
 
     arm: Arm = "twinning"
     realisations: AtLeastOne = 5
-    records: AtLeastOne = 1
+    records: AtLeastOne = 8
     virtual_episodes: AtLeastOne = 20
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
@@ -236,20 +239,12 @@ class TwinningConfig:
 
 
 PAPER = TwinningConfig(
-    learner=LearnerConfig(algorithm="relaxed_ddpg", target_rate=0.02),
-    assimilation=AssimilationConfig(segment=0),
-    planner=PlannerConfig(method="single_start"),
+    records=1,
+    learner=LearnerConfig(algorithm="relaxed_ddpg", critic_iterations=500, actor_iterations=1000, target_rate=0.02),
+    assimilation=AssimilationConfig(method="adam", inputs="realisations", segment=0),
+    planner=PlannerConfig(method="single_start", iterations=10, realisations=None, descent=DescentConfig()),
     referee=RefereeConfig(rule="decision_tree"),
     hypotheses=HypothesesConfig(which=("none",)),
 )
 """The paper's algorithm, with the numbers of its first test case (Table 1, row T1). Of what the paper does not print,
 τ is 0.02, with which the critic stays finite, and optimisers, their rates and the exploration are the library's."""
-
-FEW_COEFFICIENTS = TwinningConfig(
-    records=8,
-    learner=LearnerConfig(critic_iterations=200, actor_iterations=200),
-    assimilation=AssimilationConfig(method="levenberg_marquardt", inputs="record"),
-    planner=PlannerConfig(iterations=40, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-)
-"""For a plant with at most some ten unknown coefficients, whose inputs are measured: step 4 solves least squares over
-the last eight records, and step 5 descends by L-BFGS."""
