@@ -156,6 +156,15 @@ def test_a_run_begins_with_the_controller_once(tmp_path):
     )
 
 
+def test_a_resumed_run_knows_the_controller_that_flew_first(tmp_path):
+    whole = run(tmp_path / "whole", start="controller").train()["summary"]
+    small_run(tmp_path / "half", 1, parts={"first": PD}, start="controller").train()
+    resumed = run(tmp_path / "half", start="controller", resume=True)
+    assert isinstance(resumed.algorithm.steps["interact"].supervisor.controller, PD)
+    summary = resumed.train()["summary"]
+    assert summary["first"] == whole["first"] and summary["unseen"]["costs"] == whole["unseen"]["costs"]
+
+
 def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
     with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
         small_run(tmp_path / "run", start="controller")

@@ -33,7 +33,8 @@ MakesStart = Callable[[Plant, nn.Module], Start | None]
 def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> MakesStart:
     """Read and check what ``config.start`` names.
 
-    A run that goes on from a checkpoint has begun already, so that nothing is read for it.
+    A run that goes on from a checkpoint has begun already: the flights of a log are in it, so that the log is not read
+    again. What has flown first may act again.
 
     Args:
         config: options of the run.
@@ -47,8 +48,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start
-    resumed = config.resume and config.log_dir is not None and checkpoints(config.log_dir)
-    if resumed or name == "random":
+    if name == "random":
         return lambda physics, closure: None
     if name == "controller":
         if controller is None:
@@ -61,7 +61,10 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     path = Path(name)
     if path.is_dir():
         return _of_run(path, config, plant)
-    if path.suffix.lower() in READERS and path.is_file():
+    is_log = path.suffix.lower() in READERS
+    if is_log and config.resume and config.log_dir is not None and checkpoints(config.log_dir):
+        return lambda physics, closure: None
+    if is_log and path.is_file():
         return _of_log(path, config, plant)
     raise ValueError(
         f"start={name!r} is none of {', '.join(STARTS)}, and there is no such run folder or log; a log ends in "
