@@ -122,6 +122,12 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     fit = assimilation(plant, closure, initial="measured")
     record = line_segment(0.7 * times + noise, wind=0.0)
     fit.update([record], [], 1, generator)
-    (error,) = fit.standard_errors([record]).values()
+    (error,) = fit.uncertainty([record]).standard_errors().values()
     assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
+    # A slope that the fit has not reached is off by as much more.
+    off = 10.0 * error
+    with torch.no_grad():
+        closure.w.add_(off)
+    (wider,) = fit.uncertainty([record]).standard_errors().values()
+    assert wider == pytest.approx(off, rel=0.02)

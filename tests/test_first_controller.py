@@ -145,15 +145,16 @@ def run(folder, **options):
     return small_run(folder, 2, parts={"first": PD}, **options)
 
 
-def test_a_run_begins_with_the_controller_once(tmp_path):
+def test_a_run_begins_with_the_controller_once(tmp_path, capsys):
     metrics = run(tmp_path, start="controller").train()
     first, second = metrics["episodes"]
     assert first["start_cost"] > 0.0 and "start_cost" not in second
     assert '"start": "controller"' in (tmp_path / "config.json").read_text()
-    assert (
-        metrics["summary"]["unseen"]["baselines"].keys() == {"PD"}
-        and len(metrics["summary"]["unseen"]["costs"]["PD"]) == 3
-    )
+    unseen, live = metrics["summary"]["unseen"], metrics["summary"]["live"]
+    assert unseen["baselines"].keys() == {"PD"} and len(unseen["costs"]["PD"]) == 3
+    ratio = sum(unseen["costs"][live]) / sum(unseen["costs"]["PD"])
+    assert unseen["baselines"]["PD"]["ratio"]["mean"] == pytest.approx(ratio)
+    assert f"costs {ratio:.4g} [" in capsys.readouterr().out
 
 
 def test_a_resumed_run_knows_the_controller_that_flew_first(tmp_path):

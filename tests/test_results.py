@@ -199,7 +199,7 @@ def many_weights(metrics, count):
     merit = {f"quantity {k}": {"mean": 1.0, "median": 1.0} for k in range(5)}
     cost = {"mean": 2.0, "confidence_interval": [1.0, 3.0]}
     unseen = metrics["summary"]["unseen"] | {"merit": dict.fromkeys(("model_based", "model_free"), merit)}
-    unseen |= {"baselines": {"PI": {"J_a": cost, "merit": merit}}}
+    unseen |= {"baselines": {"PI": {"J_a": cost, "merit": merit, "ratio": cost, "cheaper": 0}}}
     start = {f"c{k}": 1.0 for k in range(count)}
     found = start | {"c3": 2.0, "c5": 1.5, "c7": None}
     closure = {"start": start, "found": found, "true": {}, "described": {}}

@@ -361,3 +361,8 @@ def mean_with_confidence(values: Float[Tensor, " n"], over: Float[Tensor, " n"] 
     options = {"n_resamples": 2000, "method": "percentile", "rng": np.random.default_rng(0)}
     interval = bootstrap(samples, statistic, paired=True, **options).confidence_interval
     return {"mean": mean, "confidence_interval": [float(interval.low), float(interval.high)]}
+
+
+def compared(costs: Costs, others: Costs) -> dict[str, Any]:
+    """The mean of costs over that of others in the same episodes, with its interval, and how many are lower."""
+    return {"ratio": mean_with_confidence(costs, others), "cheaper": int((costs < others).sum())}

@@ -47,6 +47,8 @@ SHORT = 60
 """Number of short segments of a record, which tell whether a twin is unstable."""
 GROWTH = 1e3
 """Factor by which errors of first states grow along the records of a system that is called unstable."""
+ALIKE = 0.5
+"""Correlation of neighbouring residuals above which they are no noise."""
 DEPARTURE = 3.0
 """Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""
 SHORTENED = 3
@@ -251,6 +253,8 @@ class Estimate(NamedTuple):
                     f"and the readings scatter by {size:.3g}. Check columns and units, the inputs that act on the "
                     "system, and what the plant leaves out; then try other first weights (starts)"
                 )
+        if words := not_white(self.likelihood):
+            warnings.append(words)
         if self.before and all(self.after[name] == value for name, value in self.before.items()):
             warnings.append("no weight has moved: no step lowers the cost of the fit. Try other first weights")
         return warnings + self.uncertainty.warnings()
@@ -582,3 +586,14 @@ def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
                 products[k] += r[1:] @ r[:-1]
                 squares[k] += r @ r
     return products / squares
+
+
+def not_white(likelihood: Likelihood) -> str:
+    """What residuals that are no noise say of the standard errors; empty where neighbours are hardly alike."""
+    pairs = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), strict=True)
+    if not (alike := [f"{sensor.name} ({value:.2g})" for sensor, value in pairs if value > ALIKE]):
+        return ""
+    return (
+        f"neighbouring residuals of {', '.join(alike)} are alike: the twin lacks something, or steps or reads too "
+        "coarsely, and standard errors do not hold what that changes"
+    )

@@ -14,8 +14,9 @@ and noise that differs between samples:
 Residuals are orthogonal to their derivatives, so that M of a short record is too small: it is multiplied by n/(n − p),
 for n samples and p unknowns, and no combination of the unknowns is told better than by white noise of their size.
 
-Named values of the closure take their errors from those of the weights to first order. Both formulas assume that the
-physics is right: an error that no weights can remove is bias, and no record shows its size.
+Named values of the closure take their errors from those of the weights to first order. Where a fit has not arrived, the
+change Δ by a Newton step counts as well, :math:`\sqrt{\sigma^2 + \Delta^2}`. Both formulas assume that the physics is
+right: an error that no weights can remove is bias, and no record shows its size.
 
 Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
 """
@@ -59,9 +60,11 @@ class Uncertainty:
     def __init__(self, likelihood: Likelihood, *, errors: Errors = "fisher"):
         self.likelihood, self.errors = likelihood, errors
         blocks = likelihood.residuals()
-        self.information = likelihood.normal_equations(blocks).matrix
+        equations = likelihood.normal_equations(blocks)
+        self.information = equations.matrix
         self._inverse = inverse_information(self.information)
         self.covariance, self.null = self._inverse.matrix, self._inverse.null
+        ahead = -(self.covariance @ equations.gradient)[: likelihood.weight_count]  # the Newton step
         if errors == "robust":
             M, samples = torch.zeros_like(self.information), 0
             for block in blocks:
@@ -76,6 +79,7 @@ class Uncertainty:
             self.covariance = (root * ratios.clamp_min(white)) @ root.T
         closure = likelihood.twin.closure
         self.names, self._slopes = named_slopes(closure)
+        self._ahead = self._slopes @ ahead
         self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
 
     @property
@@ -103,7 +107,7 @@ class Uncertainty:
 
     def standard_errors(self) -> dict[str, float]:
         """Standard error of every named value; infinite for one of which the data say nothing, zero for a fixed one."""
-        errors = self.named_covariance.diagonal().clamp_min(0.0).sqrt().tolist()
+        errors = (self.named_covariance.diagonal().clamp_min(0.0) + self._ahead.square()).sqrt().tolist()
         return dict(zip(self.names, errors, strict=True)) | dict.fromkeys(self.unknown(), math.inf)
 
     def correlations(self) -> Float[Tensor, "n_named n_named"]:

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes, compared
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
@@ -172,8 +172,7 @@ def entries(
         costs = judgement.control_costs
         controllers[name] = {"episodes": len(costs)} | judgement.statistics()
         if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
-            best = judged[live].control_costs
-            controllers[name] |= {"ratio": mean_with_confidence(best, costs), "cheaper": int((best < costs).sum())}
+            controllers[name] |= compared(judged[live].control_costs, costs)
     return {
         "controllers": controllers,
         "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.optimum import exact_optimum
-from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
+from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
@@ -106,7 +107,7 @@ def summarise(
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
         "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on, "J_p_each": J_p.tolist()}
         | {name: mean_with_confidence(values) for name, values in means.items()}
-        | results(judged),
+        | results(judged, live),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
         "first": None if first is None else dict(zip(("expected", "paid"), first, strict=True)),
@@ -124,16 +125,18 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     """How the believed twin replays the records that it was last fitted to.
 
     ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
-    0; ``standard_errors`` those of the closure's coefficients.
+    0; ``standard_errors`` those of the closure's coefficients, and ``note`` what these do not hold, in words.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
-        return {"rms": {}, "segment": 0, "standard_errors": {}}
+        return {"rms": {}, "segment": 0, "standard_errors": {}, "note": ""}
     latest, _ = algorithm.virtual.paired(records)
+    uncertainty = assimilation.uncertainty(latest)
     return {
         "rms": assimilation.rms_errors(latest),
         "segment": assimilation.length,
-        "standard_errors": assimilation.standard_errors(latest),
+        "standard_errors": {} if uncertainty is None else uncertainty.standard_errors(),
+        "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
     }
 
 
@@ -163,9 +166,11 @@ def twin_costs(
     return [unseen.identification_costs(physics, closure, flown, segment) for physics, closure in laws]
 
 
-def results(judged: dict[str, Judged]) -> dict[str, Any]:
-    """Statistics of all controllers on the unseen episodes."""
+def results(judged: dict[str, Judged], live: Role) -> dict[str, Any]:
+    """Statistics of all controllers on the unseen episodes, of classical ones with the live policy beside."""
     overall = {name: judgement.statistics() for name, judgement in judged.items()}
+    for name in overall.keys() - set(ROLES):
+        overall[name] |= compared(judged[live].control_costs, judged[name].control_costs)
     return {
         **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
         "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
@@ -286,6 +291,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
+        lines.append(beside_line(baseline, n))
     lines += merit_lines(unseen)
     lines += real_lines(summary.get("real_unseen"), summary["twin"]["segment"])
     paid = summary["cost_of_learning"]
@@ -303,6 +309,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(summary["twin"])
     lines += closure_lines(summary["closure"], summary["twin"]["standard_errors"])
+    lines += [f"  {note}" for note in [summary["twin"]["note"]] if note]
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in summary["seconds"].items()))
     return "\n".join(lines)
 
@@ -322,11 +329,15 @@ def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
             f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean} {_interval(entry['J_a'])}"
         )
         if "ratio" in entry:
-            cheaper = f"cheaper in {entry['cheaper']} of {entry['episodes']}"
-            ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
-            lines.append(f"    on the same episodes the live policy costs {ratio} of it, {cheaper}")
+            lines.append(beside_line(entry, entry["episodes"]))
         lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in entry["merit"].items()]
     return lines
+
+
+def beside_line(entry: dict[str, Any], episodes: int) -> str:
+    """A line with what the live policy costs beside a controller in the same episodes."""
+    ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
+    return f"    on the same episodes the live policy costs {ratio} of it, cheaper in {entry['cheaper']} of {episodes}"
 
 
 def _number(value: float | None, digits: str) -> str:

@@ -261,14 +261,13 @@ class Assimilation:
         errors = self._rms(self.in_segments(batch_of(records))).tolist()
         return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
 
-    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
-        """Robust standard errors of the closure's named coefficients; none where the twin diverges or names nothing.
+    def uncertainty(self, records: Sequence[Trajectory]) -> Uncertainty | None:
+        """Robust standard errors of the closure's named coefficients; None where the twin diverges or names nothing.
 
-        The residuals over the segments that the last fit used tell the noise; see
-        :class:`rt_torchrl.fit.uncertainty.Uncertainty`.
+        The residuals over the segments that the last fit used tell the noise.
         """
         if not records or not hasattr(self.twin.closure, "named_coefficients"):
-            return {}
+            return None
         replayed = self.in_segments(batch_of(records))
         read, noise = self._compared(replayed)
         noise = torch.maximum(self._rms(replayed), 1e-9 * noise)
@@ -276,8 +275,8 @@ class Assimilation:
             likelihood = self._problem.likelihood(read, noise)
             if self.config.initial == "estimated":
                 likelihood.initial.load_state_dict(self._problem.fit_initial_states(read, noise).initial.state_dict())
-            return Uncertainty(likelihood, errors="robust").standard_errors()
-        return {}
+            return Uncertainty(likelihood, errors="robust")
+        return None
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""

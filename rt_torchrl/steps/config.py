@@ -198,7 +198,7 @@ class TwinningConfig:
     """Hyper-parameters of the algorithm, by step.
 
     The defaults suit a plant with some ten unknown coefficients whose inputs are measured: step 4 solves least squares
-    over the last eight records, and step 5 descends by L-BFGS on twenty virtual episodes. :data:`PAPER` has the paper's.
+    over the last eight records, and step 5 descends by L-BFGS on twenty virtual episodes. The paper's are ``PAPER``.
 
     Args:
         arm: part of the algorithm that runs: ``twinning`` for all six steps, ``model_free`` for steps 1 and 2 alone, or

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.fit.least_squares import SHORT
+from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.extension import Extension
@@ -366,10 +367,10 @@ class EnsembleAssimilation(Assimilation):
         fit = self.fits.get(self.ensemble.likeliest)
         return super().rms_errors(records) if fit is None else fit.whole.rms_errors(fit.rested(records))
 
-    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
-        """Standard errors of the likeliest hypothesis; see :meth:`Assimilation.standard_errors`."""
+    def uncertainty(self, records: Sequence[Trajectory]) -> Uncertainty | None:
+        """Standard errors of the likeliest hypothesis; see :meth:`Assimilation.uncertainty`."""
         fit = self.fits.get(self.ensemble.likeliest)
-        return super().standard_errors(records) if fit is None else fit.whole.standard_errors(fit.rested(records))
+        return super().uncertainty(records) if fit is None else fit.whole.uncertainty(fit.rested(records))
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
