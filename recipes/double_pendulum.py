@@ -128,7 +128,6 @@ class Config(rt.RunConfig):
 
     episodes: int = 6
     real_unseen: int = 20
-    start: str = "controller"
 
     def plant(self) -> DoublePendulum:
         return DoublePendulum()

@@ -136,7 +136,6 @@ class Config(rt.RunConfig):
     hidden: tuple[int, ...] = (16, 16)
     episodes: int = 6
     real_unseen: int = 20
-    start: str = "controller"
 
     def plant(self) -> Drive:
         return Drive()

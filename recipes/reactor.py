@@ -116,7 +116,6 @@ class Config(rt.RunConfig):
 
     episodes: int = 6
     real_unseen: int = 20
-    start: str = "controller"
 
     def plant(self) -> Reactor:
         return Reactor()

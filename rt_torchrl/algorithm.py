@@ -24,6 +24,7 @@ and what each step reports beside. What lasts between episodes belongs to the st
 """
 
 import copy
+import dataclasses
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -120,6 +121,8 @@ class ReinforcementTwinning(TensorDictSequential):
         make_policy: Callable[[torch.Generator], nn.Module] | None = None,
     ):
         policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
+        if first is not None:
+            config = dataclasses.replace(config, exploration=config.exploration.imitating())
         learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
         planner = planner or make_planner(twin, model_based, config.planner)
         referee = referee or make_referee(config.referee, first_live(config.arm, first))

@@ -15,7 +15,8 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe
 
 ROOT = Path(__file__).parents[1]
 HERE = (str(ROOT / "rt_torchrl"), str(ROOT / "envs"))
-TRACER = str(ROOT / "rt_torchrl" / "programs" / "tracer.py")
+RARE = {str(ROOT / "rt_torchrl" / name) for name in ("programs/tracer.py", "trajectories/anchored.py")}
+"""Files of what few late episodes do: tracing, and the correction of a twin that a real episode contradicts."""
 LATE = 4
 """Number of episodes after which a training hardly traces anything new, as plans, beliefs and fits have begun."""
 FUNCTIONS, FILES = 260, 35
@@ -79,7 +80,7 @@ def test_torchrl_is_in_the_path_that_runs_by_default_which_goes_through_few_func
     assert len(sample) == 6 * 2 * 2  # of six episodes with two phases, fifty batches at once
     assert len(refresh) == 7 + 6 * 2
     assert not adjoint
-    usual = [seen for seen in functions.values() if seen and not any(file == TRACER for file, _ in seen)]
+    usual = [seen for seen in functions.values() if seen and not any(file in RARE for file, _ in seen)]
     assert usual
     for seen in usual:
         assert 150 < len(seen) <= FUNCTIONS and len({file for file, _ in seen}) <= FILES

@@ -21,6 +21,7 @@ import functools
 import gc
 import hashlib
 import inspect
+import operator
 import os
 import random
 import sys
@@ -490,7 +491,6 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
         ImpureError: if a second answer is another one, although none but other questions were asked in between; if a
             question changes a buffer; or if the answer for a realisation depends on the others.
     """
-    last = tree_map(lambda x: x[-1:], arguments)
     strided = {name: x for name, x in module.named_buffers() if x.layout is torch.strided}
     copies = {name: x.clone() for name, x in strided.items()}
     answers = _answers(module, arguments)
@@ -511,19 +511,20 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
         raise ImpureError(
             f"{_called(module, path)} gives something else when it is called again with the same arguments. {PURE}."
         )
-    try:
-        alone = module(*last).detach()
-    except Exception as error:
-        raise ImpureError(
-            f"an interval of one realisation alone raises {type(error).__name__}: {str(error).rstrip('.')}; one of "
-            f"{len(first)} realisations does not. Policy, closure and plant must take any number of rows."
-        ) from error
-    if not _equal([alone], [first[-1:]]):
-        raise ImpureError(
-            "the end of an interval depends on the other realisations that are computed with it: it is "
-            f"{alone[-1].tolist()} alone and {first[-1].tolist()} beside others. Rows are systems of their own: no "
-            "sum, mean, norm or branch over a leading dimension in policy, closure or plant."
-        )
+    for row in (slice(-1, None), slice(1)):  # a loop may run until one of both has converged
+        try:
+            alone = module(*tree_map(operator.itemgetter(row), arguments)).detach()
+        except Exception as error:
+            raise ImpureError(
+                f"an interval of one realisation alone raises {type(error).__name__}: {str(error).rstrip('.')}; one of "
+                f"{len(first)} realisations does not. Policy, closure and plant must take any number of rows."
+            ) from error
+        if not _equal([alone], [first[row]]):
+            raise ImpureError(
+                "the end of an interval depends on the other realisations that are computed with it: it is "
+                f"{alone[0].tolist()} alone and {first[row][0].tolist()} beside others. Rows are systems of their own: "
+                "no sum, mean, norm or branch over a leading dimension in policy, closure or plant."
+            )
 
 
 class _Answer(NamedTuple):

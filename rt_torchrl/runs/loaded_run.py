@@ -173,7 +173,7 @@ class LoadedRun:
         flights = sum(entry.get("windows", 1) + entry.get("episodes_refused", 0) for entry in episodes)
         # What is imitated has flown once before, unless its flights are those of a log.
         flown_first = any("start_cost" in entry for entry in episodes)
-        recorded = Path(self.config.start).suffix.lower() in READERS
+        recorded = Path(self.config.start or "").suffix.lower() in READERS
         return wear(int(flights) + (flown_first and not recorded) - 1)
 
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:

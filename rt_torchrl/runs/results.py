@@ -439,8 +439,8 @@ def dearer_than_first(summary: Mapping[str, Any]) -> str:
         return ""
     expected = _number(first["expected"], ".4g")
     return (
-        f"the live policy is expected to cost {expected} on the real system, where the controller that flew first paid "
-        f"{first['paid']:.4g}"
+        f"in the real episodes of the controller that flew first, which cost {first['paid']:.4g}, the live policy is "
+        f"expected to cost {expected}"
     )
 
 

@@ -1,6 +1,7 @@
 """A run, which a recipe's main makes: the algorithm with its progress, dashboard, checkpoints and results."""
 
 import copy
+import dataclasses
 import errno
 import functools
 import time
@@ -96,6 +97,8 @@ class Run:
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
+        if config.start is None:
+            config = dataclasses.replace(config, start="random" if first is None else "controller")
         self.config = config.effective()
         self.ended: str | None = None
         self.callbacks = callbacks
@@ -301,7 +304,7 @@ class Run:
         """
         config, live = self.config, self.algorithm.referee.live
         interrupted = len(self.episodes) < config.episodes and self.ended is None
-        if self._real is None or not config.real_unseen or interrupted:
+        if self._real is None or not config.real_unseen:
             return None
         reason = real_side.grounded(config, self.algorithm, self.initial_policies)
         if reason:
@@ -310,7 +313,7 @@ class Run:
         if before := real_side.judged_before(self.folder, len(self.episodes), laws, config.real_unseen):
             bar.write("the real system has been flown after these episodes; it is not flown again")
             return before
-        if not laws:
+        if not laws or interrupted:
             return None
         bar.write(real_side.announcement(laws, live, config.real_unseen))
         bar.doing("judging on the real system")

@@ -30,8 +30,6 @@ Callback = Callable[[Sequence[dict[str, Any]]], str | None]
 None to go on."""
 
 
-SPREAD_OF_IMITATION = 0.02
-"""Exploration around the imitation of a controller, as a share of half the range of each action."""
 Preset = Literal["default", "paper", "neural", "mpc"]
 """Name of what the options of a training are by default."""
 STARTS = ("random", "controller", "mpc")
@@ -63,7 +61,8 @@ class RunConfig:
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default or, beside an acting process, takes the cores that it
             leaves. Updates of step 2 run on one.
-        start: what the training begins with, so that the real system never flies a random policy. controller: the
+        start: what the training begins with, so that the real system never flies a random policy; by default the
+            controller that the run is given as its first one, and else random weights. controller: the
             controller that the real system has had so far flies one episode before all others, and twin and policies
             learn from it. mpc: model predictive control on the first twin flies that episode. The folder of a finished
             run: its policies and its closure go on. A log, as a .csv or .parquet file that identify.py reads: the twin
@@ -107,7 +106,7 @@ class RunConfig:
     engine: Engine = "native"
     device: str = "cpu"
     threads: options.Count = 0
-    start: options.Text = "random"
+    start: options.Text | None = None
     log: LogConfig = field(default_factory=LogConfig)
     config: options.File | None = None
     log_dir: options.File | None = None
@@ -130,7 +129,7 @@ class RunConfig:
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.real_unseen == 1:  # no mean of one episode has a confidence interval
             raise ValueError("real_unseen=1 must be 0, or at least 2.")
-        if self.log != LogConfig() and self.start in STARTS:
+        if self.log != LogConfig() and self.start in (None, *STARTS):
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
@@ -201,16 +200,6 @@ class RunConfig:
         """
         return {"default": {}, "paper": {"start": "random", "twinning": PAPER}, "neural": {"closure": "mlp"}}
 
-    def suited(self, twinning: TwinningConfig) -> TwinningConfig:
-        """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
-
-        A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
-        """
-        if self.start == "random":
-            return twinning
-        exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
-        return dataclasses.replace(twinning, exploration=exploration)
-
     def defaults(self) -> "RunConfig":
         """The defaults of all options on a command line, given the preset, start and closure that it asks for.
 
@@ -225,8 +214,7 @@ class RunConfig:
             planner = defaults.twinning.planner
             planner = dataclasses.replace(planner, method="receding_horizon")
             defaults = dataclasses.replace(defaults, twinning=dataclasses.replace(defaults.twinning, planner=planner))
-        with_start = self if self.start != usual.start else dataclasses.replace(self, start=defaults.start)
-        return dataclasses.replace(defaults, twinning=with_start.suited(defaults.twinning))
+        return defaults
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Function from an episode's number to the real system's closure; None if the real system does not wear.
@@ -236,16 +224,19 @@ class RunConfig:
         return None
 
     def effective(self) -> "RunConfig":
-        """The options that the run carries out, in which ``quick`` has replaced other options."""
+        """The options that the run carries out, in which ``start`` and ``quick`` have replaced other options."""
+        twinning = self.twinning
+        if self.start not in (None, "random"):
+            twinning = dataclasses.replace(twinning, exploration=twinning.exploration.imitating())
         if not self.quick:
-            return self
-        usual = self.twinning.learner
+            return dataclasses.replace(self, twinning=twinning)
+        usual = twinning.learner
         learner = dataclasses.replace(
             usual,
             critic_iterations=min(usual.critic_iterations, QUICK_ITERATIONS),
             actor_iterations=min(usual.actor_iterations, QUICK_ITERATIONS),
         )
-        twinning = dataclasses.replace(self.twinning, learner=learner)
+        twinning = dataclasses.replace(twinning, learner=learner)
         return dataclasses.replace(
             self,
             quick=False,

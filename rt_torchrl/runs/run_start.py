@@ -47,7 +47,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     Raises:
         ValueError: if there is no such source, or it does not fit the run.
     """
-    name = config.start
+    name = config.start or "random"
     if name == "random":
         return lambda physics, closure: None
     if name == "controller":

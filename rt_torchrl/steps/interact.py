@@ -486,5 +486,5 @@ class Interact(Step):
         if pilot == FIRST:
             self.belief.append_first(flight.record, flight.cost.item())
         else:
-            explored = strength * self.config.exploration.spread
+            explored = strength * self.config.exploration.noise
             self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), explored, weights)

@@ -1,5 +1,6 @@
 """Exploration of step 1, noise on the command of the live policy; and bumpless handover from one policy to the next."""
 
+import dataclasses
 import math
 
 import torch
@@ -11,6 +12,9 @@ from rt_torchrl.options import Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+
+OF_RANDOM_WEIGHTS, OF_IMITATIONS = 0.2, 0.02
+"""Spread of the noise around random weights, and around policies that imitate a controller."""
 
 
 @configuration
@@ -24,7 +28,9 @@ class ExplorationConfig:
     .. math:: x_{k+1} = \rho x_k + \sqrt{1 - \rho^2}\,w_k, \qquad \rho = e^{-\Delta t/\tau}
 
     Args:
-        spread: standard deviation of the noise on each action, as a share of half its range, in the first episode.
+        spread: standard deviation of the noise on each action, as a share of half its range, in the first episode; by
+            default 0.2, or 0.02 where a training begins with a controller, a log or an earlier one: a real system that
+            a controller has held so far need not meet the noise that finds out what actions do at all.
         episodes: number of episodes until ξ is zero; with 0 no episode explores.
         correlation_time: correlation time τ of the noise [s]; 0 makes the noise new at each control interval, as in
             the paper.
@@ -33,9 +39,18 @@ class ExplorationConfig:
         ValueError: if an option is not a number of its type, is negative or not finite.
     """
 
-    spread: NotNegative = 0.2
+    spread: NotNegative | None = None
     episodes: Count = 5
     correlation_time: NotNegative = 0.0
+
+    @property
+    def noise(self) -> float:
+        """The spread, that of random weights where none is given."""
+        return OF_RANDOM_WEIGHTS if self.spread is None else self.spread
+
+    def imitating(self) -> "ExplorationConfig":
+        """The same noise in a training that does not begin with random weights."""
+        return self if self.spread is not None else dataclasses.replace(self, spread=OF_IMITATIONS)
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""
@@ -65,7 +80,7 @@ class LivePolicy(nn.Module):
         self.register_buffer("high", high)
         self.policy, self.strength, self._dt, self._intervals = policy, 0.0, plant.dt, 0
         self._noise: Tensor | None = None
-        self._scale = 0.5 * config.spread * (high - low)
+        self._scale = 0.5 * config.noise * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
         self.generator, self._plant = generator, (plant,)
 

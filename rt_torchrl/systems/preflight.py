@@ -50,6 +50,8 @@ FLOOR = 3e-4
 """Share below which a prediction counts as exact, whatever the digits of sensors and integrators."""
 MARGIN = math.log(8.0)
 """Least gain of a mistake that is named, and by how much it must be ahead of others to be named alone."""
+WORSE = 1.02
+"""Share of a state that a mistake may leave, over that which the present wiring leaves."""
 LARGE, WORST = 1e3, 1e6
 """Error, in movements, and share that stand for a prediction that is not finite."""
 EVALUATIONS, QUICK = 12, 4
@@ -143,6 +145,7 @@ class Wiring(NamedTuple):
                 f"  much less is unexplained if {mistake.mistake}: {shares}" if shares else f"  {mistake.mistake}"
             )
         rows += [f"  {doubt}" for doubt in self.doubts]
+        rows += [] if self.mistakes else ["  no mistake in the wiring explains the readings better"]
         return "\n".join(rows)
 
     def require(self) -> None:
@@ -316,8 +319,9 @@ def _at_first(fit: "_Fit", flown: Flown) -> list[Suspicion]:
 def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
     """The mistakes that fit much better than the wiring as it is, one of a kind.
 
-    A mistake in the reading of a state must leave at most half of that state. Where no error of the present wiring
-    shows beside the size of its state, a mistake must explain all movement.
+    A mistake in the reading of a state must leave at most half of that state, and others hardly more of any state than
+    the present wiring. Where no error of the present wiring shows beside the size of its state, a mistake must explain
+    all movement.
     """
     shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any()
     enough = torch.where(present.unexplained > 2.0 * EXPLAINED, 0.5 * present.unexplained, EXPLAINED)
@@ -326,7 +330,7 @@ def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
     for words, mended in ranked[:FITTED]:
         mistake = fit.suspicion(words, mended)
         changed = (mended.states != flown.states).any(0)
-        limit = torch.where(changed, enough, torch.inf) if shows else EXPLAINED
+        limit = torch.where(changed, enough, WORSE * present.unexplained + EXPLAINED) if shows else EXPLAINED
         if not (mistake.unexplained > limit).any():
             tried.append(mistake)
     tried.sort(key=lambda mistake: mistake.score)
@@ -418,7 +422,8 @@ class _Fit:
             change = -(slopes[weights.tobytes()] / size[:, None])[:, moves]
             return change.flatten(0, 1).nan_to_num(0.0, 0.0, 0.0).numpy()
 
-        best = least_squares(residuals, self.guess.numpy(), jac=jacobian, max_nfev=evaluations)
+        with np.errstate(over="ignore"):  # of a mistake under which the twin explodes
+            best = least_squares(residuals, self.guess.numpy(), jac=jacobian, max_nfev=evaluations)
         return torch.as_tensor(best.x)
 
     @torch.no_grad()

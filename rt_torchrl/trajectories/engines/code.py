@@ -37,8 +37,8 @@ TRIES = 3
 """Number of points without a number by torch after which an interval is left to torch."""
 KEPT = 256
 """Number of kinds of intervals whose machine code is kept."""
-ROWS = 4
-"""Number of realisations with which an interval is asked that does not become machine code."""
+ROWS = 8
+"""Least number of realisations with which an interval is asked whether it is a function of each alone."""
 NUDGE = 1e-3
 """Relative change of the signals of a point, so that no two rows are equal."""
 
@@ -386,7 +386,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         if code is None or (isinstance(code, IntervalCode) and differentiated and driven not in code.sweeps):
             if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
-            point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
+            point = point_of(initial_state, drive, max(ROWS, lanes_of_this_machine().number), sums)
             code = _compiled(code, key, interval, point, holdings, driven if differentiated else None)
             if code is None:
                 return None
@@ -409,7 +409,9 @@ def _compiled(
     try:
         if code is None:
             require_pure(interval, *point)
-            code = IntervalCode(interval, point, lanes_of_this_machine(), holdings)
+            lanes = lanes_of_this_machine()
+            one_each = torch.arange(0, len(point.state), len(point.state) // lanes.number)
+            code = IntervalCode(interval, point.rows(one_each), lanes, holdings)
         if driven is not None:
             code.prepare_sweep(interval, driven, holdings)
     except ImpureError:
