@@ -5,11 +5,8 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 from printed_commands import ROOT, commands
@@ -49,57 +46,16 @@ def clone(tmp_path_factory):
     return folder
 
 
-def started(command, clone, **options):
+def done(command, clone):
     """The command as printed, in a shell; uv takes the environment of this process instead of making one."""
     if shutil.which("uv") is None:
         pytest.skip("the printed commands are run by uv")
-    environment = {
-        **os.environ,
-        "UV_NO_SYNC": "1",
-        "UV_PROJECT_ENVIRONMENT": sys.prefix,
-        "PYTHONPATH": str(clone),  # before what that environment has installed
-    }
-    return subprocess.Popen(
-        ["bash", "-c", command], cwd=clone, env=environment, text=True, start_new_session=True, **options
-    )
-
-
-def done(command, clone):
-    """The command run to its end."""
-    process = started(command, clone, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    try:
-        out, err = process.communicate(timeout=PATIENCE)
-    finally:
-        end(process)
-    assert process.returncode == 0, f"{command}\n{out[-2000:]}\n{err[-3000:]}"
-    return subprocess.CompletedProcess(command, process.returncode, out, err)
-
-
-def end(process):
-    """End a command with all that it has started."""
-    if process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def require_begun(command, clone, tmp_path, sign):
-    """The command says what it says once it is at work; it is ended then."""
-    with open(tmp_path / "said", "w+b") as said:
-        process = started(command, clone, stdout=said, stderr=said)
-        begin = time.monotonic()
-        try:
-            while not re.search(sign, text := Path(said.name).read_text(encoding="utf-8", errors="replace")):
-                assert process.poll() is None, f"{command}\n{text[-3000:]}"
-                assert time.monotonic() - begin < PATIENCE, f"{command}\n{text[-3000:]}"
-                time.sleep(0.5)
-        finally:
-            end(process)
-
-
-def test_the_first_command_begins(clone, tmp_path):
-    """Up to its first real episode; the commands below do so in this process."""
-    assert TRAININGS[0] == "uv run recipes/wind_turbine.py --quick"
-    require_begun(TRAININGS[0], clone, tmp_path, "checking the gradient")
+    # The folder comes before what that environment has installed.
+    own = {"UV_NO_SYNC": "1", "UV_PROJECT_ENVIRONMENT": sys.prefix, "PYTHONPATH": str(clone)}
+    options = {"cwd": clone, "env": os.environ | own, "timeout": PATIENCE}
+    ended = subprocess.run(["bash", "-c", f"exec {command}"], capture_output=True, text=True, **options)
+    assert ended.returncode == 0, f"{command}\n{ended.stdout[-2000:]}\n{ended.stderr[-3000:]}"
+    return ended
 
 
 class BegunError(Exception):
@@ -123,6 +79,7 @@ def require_begun_here(command, clone, monkeypatch, begin):
 @pytest.mark.parametrize("command", TRAININGS)
 def test_a_printed_training_begins(command, clone, monkeypatch):
     """Up to its first real episode; the tests of the algorithm train on."""
+    assert TRAININGS[0] == "uv run recipes/wind_turbine.py --quick"
     if "rosco" in command:
         pytest.importorskip("rosco")
     first = "rt_torchrl.algorithm.ReinforcementTwinning.episode"
