@@ -12,14 +12,19 @@ from seeds_and_numbers import seeded
 from test_run_folder import Full
 from torch import nn
 
-from rt_torchrl import SaturatedMLP, export_c, shipped_plants
+from rt_torchrl import SaturatedMLP, shipped_plants
 from rt_torchrl.export.program import export_onnx, export_program
 
 # The same operations in double precision, at most in another order.
 ROUNDING = 1e-12
 
 
-WRITERS = {"pt2": export_program, "onnx": export_onnx, "c": export_c}
+WRITERS = {"pt2": export_program, "onnx": export_onnx}
+
+
+def require_packages(kind):
+    for package in ("onnx", "onnxruntime", "onnxscript") if kind == "onnx" else ():
+        pytest.importorskip(package)
 
 
 WITHOUT_THE_LIBRARY = """
@@ -43,11 +48,8 @@ def test_a_program_needs_torch_alone(tmp_path):
     command = [sys.executable, "-c", WITHOUT_THE_LIBRARY, tmp_path / "policy.pt2", str(rows.tolist())]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    actions, interface = done.stdout.split("\n", 1)
-    torch.testing.assert_close(
-        torch.tensor(json.loads(actions), dtype=torch.float64), policy(rows).detach(), rtol=ROUNDING, atol=0
-    )
-    described = json.loads(interface)
+    actions, described = map(json.loads, done.stdout.split("\n", 1))
+    torch.testing.assert_close(torch.tensor(actions, dtype=torch.float64), policy(rows).detach(), rtol=ROUNDING, atol=0)
     assert described["control_interval_s"] == 0.5
     assert described["action"][0] == {"name": "generator_torque", "unit": "N m", "low": 0.0, "high": 43_093.55}
 
@@ -55,8 +57,7 @@ def test_a_program_needs_torch_alone(tmp_path):
 @pytest.mark.parametrize("kind", ["pt2", "onnx"])
 @pytest.mark.parametrize("name", ["wind_turbine", "cryogenic_tank"])
 def test_programs_and_models_take_any_batch(name, kind, tmp_path):
-    for package in ("onnx", "onnxruntime", "onnxscript") if kind == "onnx" else ():
-        pytest.importorskip(package)
+    require_packages(kind)
     plant, path = shipped_plants()[name](), tmp_path / f"policy.{kind}"
     policy = plant.make_policy(seeded())
     assert WRITERS[kind](policy, path, plant) < ROUNDING
@@ -83,11 +84,10 @@ def by_onnxruntime(path):
     return lambda e: torch.from_numpy(session.run(["action"], {"observation": e.numpy()})[0]), json.loads(described)
 
 
-@pytest.mark.parametrize(("export", "name"), [(export_onnx, "policy.onnx"), (export_program, "policy.pt2")])
-def test_an_export_onto_a_full_disk_leaves_the_old_file(export, name, tmp_path, monkeypatch):
-    if export is export_onnx:
-        pytest.importorskip("onnxruntime")
-        pytest.importorskip("onnxscript")
+@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+def test_an_export_onto_a_full_disk_leaves_the_old_file(kind, tmp_path, monkeypatch):
+    require_packages(kind)
+    name = f"policy.{kind}"
     (tmp_path / name).write_text("old")
     opened = Path.open
 
@@ -98,7 +98,7 @@ def test_an_export_onto_a_full_disk_leaves_the_old_file(export, name, tmp_path, 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "open", full)
         with pytest.raises(OSError, match="No space left on device"):
-            export(LinearGain([[0.1, 0.2]]), tmp_path / name, LinearQuadratic())
+            WRITERS[kind](LinearGain([[0.1, 0.2]]), tmp_path / name, LinearQuadratic())
     assert (tmp_path / name).read_text() == "old" and [path.name for path in tmp_path.iterdir()] == [name]
 
 

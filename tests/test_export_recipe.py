@@ -82,8 +82,7 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
     ("options", "message"),
     [
         ({"role": "oracle"}, "role='oracle' does not exist in this run; choose model_based or model_free"),
-        ({"formats": ("jar",)}, r"formats=\('jar',\) must be some of c, onnx, pt2"),
-        ({"formats": ()}, r"formats=\(\) must be some of"),
+        ({"formats": ()}, r"formats=\(\) must be some of c, onnx, pt2"),
         ({"what": ("plant",)}, r"what=\('plant',\) must be some of policy, controller, twin"),
         ({"what": ("policy", "twin"), "formats": ("pt2",)}, r"formats=\('pt2',\) holds no format of the twin; add c\."),
         ({"what": ("policy", "controller"), "formats": ("pt2",)}, r"no format of the controller; add c or discon\."),
@@ -114,26 +113,21 @@ def test_without_the_packages_of_onnx_what_can_be_written_is_said_before_any_wor
 
 
 def test_folders_that_hold_no_run_are_refused(tmp_path):
-    config, _ = leave_run(tmp_path / "run", "wind_turbine", policy="paper")
+    folder = tmp_path / "run"
+    config, _ = leave_run(folder, "wind_turbine", policy="paper")
 
     def refusal(folder, message):
         with pytest.raises(ValueError, match=message):
             load_run(folder, type(config))
 
     refusal(tmp_path, "is no run folder: it has no config.json")
-    folder = tmp_path / "run"
     settings = json.loads((folder / "config.json").read_text())
     for change, message in (
         ({"plant": None}, "does not name a plant"),
         ({"plant": "balloon"}, "is a run of plant 'balloon', the recipe is of 'wind_turbine'"),
         ({"policy": "mlp"}, "weights of 'model_based' .* do not fit"),
-        ({"colour": "red"}, "has no option colour; it is of another version"),
-        (
-            {"twinning": {"referee": {"colour": "red"}}},
-            "Config has no option twinning.referee.colour; it is of another version",
-        ),
+        ({"twinning": {"referee": {"colour": "red"}}}, "has no option twinning.referee.colour; it is of another"),
         ({"episodes": "many"}, "episodes='many' must be a whole number"),
-        ({"policy": "cubic"}, "policy='cubic' does not exist; choose mlp, paper, bias or scheduled"),
         ({"wind_files": ["gone.hh"]}, "cannot be carried out: .*gone.hh"),
     ):
         (folder / "config.json").write_text(json.dumps(settings | change))
