@@ -8,9 +8,8 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
 from small_plants import Line, Slope, flown, line_segment, noise_of
-from torch import nn
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, Rollout
+from rt_torchrl import AssimilationConfig, DigitalTwin, PositiveCoefficients, Rollout
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import batch_of, identification_cost
@@ -99,24 +98,19 @@ def test_segments_start_at_their_own_time_and_state():
     assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
 
 
-class NamedSlope(nn.Module):
+class NamedSlope(PositiveCoefficients):
     """ẋ = w, a slope with a name."""
 
-    def __init__(self):
-        super().__init__()
-        self.w = nn.Parameter(torch.tensor([0.5], dtype=torch.float64))
+    names = {"slope": "m/s"}
 
     def forward(self, features):
-        return self.w + 0.0 * features
-
-    def named_coefficients(self):
-        return {"slope": self.w[0]}
+        return self.coefficients + 0.0 * features
 
 
 def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     """Over a record that begins with its first sample, a slope is the only unknown, whose error is σ/√Σt²."""
     plant, generator = Line(), torch.Generator().manual_seed(0)
-    closure, times = NamedSlope(), 0.1 * np.arange(401)
+    closure, times = NamedSlope(torch.tensor([0.5])), 0.1 * np.arange(401)
     noise = 0.05 * torch.randn(401, generator=generator, dtype=torch.float64).numpy()
     noise[0] = 0.0
     fit = assimilation(plant, closure, initial="measured")

@@ -10,7 +10,7 @@ from seeds_and_numbers import drawn
 from tensordict import TensorDict
 from test_algorithm import flown, twinning
 
-from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, Rollout, Scenario, Trajectory
+from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, Rollout, Scenario
 from rt_torchrl.steps.belief import HISTORY, Belief, alarm, difference
 from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
@@ -20,15 +20,13 @@ from rt_torchrl.steps.report import metrics
 from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
-QUIET = ExplorationConfig(spread=0.0)
 
 
 class ByGain(VirtualEpisodes):
     """Virtual episodes on which a policy costs its gain; ``flights`` counts them."""
 
     def __init__(self):
-        plant = LinearQuadratic(horizon=2.0)
-        self.twin, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), ()
+        self.twin, self.extremes = DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), ()
         self.flights, self.processes = 0, [None]
 
     def draw(self, count):
@@ -48,15 +46,9 @@ def said(policy):
     return policy.gain[0, 0].item()
 
 
-def record():
-    plant = LinearQuadratic(horizon=2.0)
-    state, exogenous = drawn(plant)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
-    return Trajectory(flown.states[0], flown.actions[0], exogenous[0])
-
-
-RECORD = record()
+PLANT = LinearQuadratic(horizon=2.0)
+with torch.no_grad():
+    (RECORD,) = Rollout(PLANT, PLANT.closure, LinearGain([[1.0, 1.0]]))(*drawn(PLANT)).each()
 
 
 class Known(Belief):
@@ -114,17 +106,11 @@ class Profit(LinearQuadratic):
         return super().running_cost(t, state, applied, exogenous) - 100.0
 
 
-@pytest.mark.parametrize("arm", ["twinning", "model_based"])
-def test_a_real_episode_of_negative_cost_is_refused_where_a_twin_says_what_it_costs(arm):
-    with pytest.raises(
-        ValueError, match=r"J_a=-\d+.* of a real episode of plant 'linear_quadratic' is negative.* add a constant"
-    ):
-        twinning(Profit(horizon=2.0), arm=arm).episode()
-
-
-@pytest.mark.parametrize("options", [{"arm": "model_free"}, {"referee": RefereeConfig(rule="decision_tree")}])
-def test_without_a_belief_costs_may_be_negative(options):
-    assert twinning(Profit(horizon=2.0), **options).episode()["real_cost"] < 0.0
+def test_a_real_episode_of_negative_cost_is_refused_where_a_belief_compares_it():
+    for options in ({"arm": "model_free"}, {"referee": RefereeConfig(rule="decision_tree")}):
+        assert twinning(Profit(horizon=2.0), **options).episode()["real_cost"] < 0.0
+    with pytest.raises(ValueError, match=r"J_a=-\d+.* of plant 'linear_quadratic' is negative.* add a constant"):
+        twinning(Profit(horizon=2.0)).episode()
 
 
 @pytest.mark.parametrize(
@@ -146,13 +132,13 @@ def test_the_alarm_says_how_wrong_the_twin_is(differences, wrong):
     assert said is None if wrong is None else wrong in said
 
 
-def report_costs(found, factor):
-    """Let the real system report its costs multiplied by a factor."""
+def dear_flights(found, factor_of):
+    """Let the real system report its costs multiplied by a factor of the policy."""
     fly = found.flights.fly
 
     def flown(policy, *, strength, whole):
         flight = fly(policy, strength=strength, whole=whole)
-        flight.transitions["next", "reward"] *= factor
+        flight.transitions["next", "reward"] *= factor_of(policy)
         return flight
 
     found.flights.fly = flown
@@ -161,10 +147,9 @@ def report_costs(found, factor):
 @pytest.mark.parametrize(("spread", "raised"), [(0.02, [1.0, 1.0]), (0.2, [0.0, 0.0])])
 def test_episodes_that_explore_raise_no_alarm(spread, raised):
     """The twin is the real system, whose costs are doubled; chance explains that where actions scatter by a fifth."""
-    plant = LinearQuadratic(horizon=2.0)
     loud = ExplorationConfig(spread=spread, episodes=10**6)
-    found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=loud)
-    report_costs(found, 2.0)
+    found = twinning(PLANT, closure=copy.deepcopy(PLANT.closure), arm="model_based", exploration=loud)
+    dear_flights(found, lambda policy: 2.0)
     reports = []
     for _ in range(2):
         flown(found)
@@ -177,24 +162,17 @@ def test_episodes_that_explore_raise_no_alarm(spread, raised):
 
 def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
     """The twin is exact in all but the cost of its own plans, which is a hundred times as high."""
-    plant = LinearQuadratic(horizon=2.0)
-    found = twinning(
-        plant,
-        closure=LinearClosure(plant.true_closure),
-        arm="model_based",
-        planner=PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-        exploration=QUIET,
-    )
-    first, fly, flights = found.policies["model_based"].gain.detach().clone(), found.flights.fly, []
+    planner = PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+    closure, quiet = LinearClosure(PLANT.true_closure), ExplorationConfig(spread=0.0)
+    found = twinning(PLANT, closure=closure, arm="model_based", planner=planner, exploration=quiet)
+    first, flights = found.policies["model_based"].gain.detach().clone(), []
 
-    def flown(policy, *, strength, whole):
-        flight = fly(policy, strength=strength, whole=whole)
+    def factor_of(policy):
         dear = (policy.gain - first).abs().max().item() > 0.05
-        flight.transitions["next", "reward"] *= 100.0 if dear else 1.0
         flights.append(policy.gain.flatten().tolist() if dear else None)
-        return flight
+        return 100.0 if dear else 1.0
 
-    found.flights.fly = flown
+    dear_flights(found, factor_of)
     reports = [found.episode() for _ in range(10)]
     refuted = [weights for weights in flights if weights]
     assert flights[0] is None and flights[1] and all(refuted.count(weights) == 1 for weights in refuted)
@@ -205,7 +183,7 @@ def test_the_cheaper_policy_acts():
     referee = ExpectedCost(RefereeConfig(clone_patience=0), "model_free")
 
     def decided(live, idle, change=1.0):
-        return referee.decide(Evidence(live_cost=live, idle_cost=idle, idle_weight_change=change)), referee.live
+        return referee.decide(Evidence(live, idle, change)), referee.live
 
     assert decided(1.0, 1.0) == ("keep", "model_free")
     assert decided(1.0, 0.999) == ("swap", "model_based")
@@ -213,27 +191,20 @@ def test_the_cheaper_policy_acts():
     assert decided(math.inf, math.inf) == ("keep", "model_based")
 
 
-class Content:
-    """A learner or planner that leaves its policy as it is."""
+class Hasty:
+    """A learner whose update gives its policy the refuted weights."""
 
     def __init__(self, policy):
         self.policy = policy
 
-    def nothing(self, *arguments):
-        pass
-
-    restart = refuse = load_state_dict = store = observations = nothing
-
-    def state_dict(self):
-        return {}
-
-
-class Hasty(Content):
-    """A learner whose update gives its policy the refuted weights."""
-
     def update(self):
         self.policy.load_state_dict(gains(2.0))
         return metrics()
+
+    def nothing(self, *arguments):
+        return {}
+
+    restart = refuse = load_state_dict = state_dict = store = observations = nothing
 
 
 @pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])
@@ -264,58 +235,32 @@ def test_a_clone_replaces_weights_that_flights_refute(corrects, kept):
     assert said(idle) == kept and ("reason" in report) == (not corrects)
 
 
-# The decision tree of step 6, table-tested on scripted costs.
+# The decision tree of step 6, on scripted costs of the live and the idle policy and weight changes of the idle one.
 
 
-WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
-MOVING, STALLED = 0.9, 0.1
-
-
-def evidence(live_cost, idle_cost, change):
-    return Evidence(live_cost=live_cost, idle_cost=idle_cost, idle_weight_change=change)
-
-
-def play(config, script, live="model_free"):
-    """Events and counters of a script of ((live cost, idle cost), weight change)."""
-    referee, found = DecisionTree(config, live=live), []
-    for costs, change in script:
-        event = referee.decide(evidence(*costs, change))
-        found.append((event, referee.worse_count, referee.stall_count))
-    return found, referee
+WORSE, BETTER, STALLED = (2.0, 1.0, 0.9), (1.0, 2.0, 0.9), (1.0, 2.0, 0.1)
+SWAP, CLONE = [*["keep"] * 2, "swap"], [*["keep"] * 3, "clone"]
+"""Events of as many episodes in a row that count, where P_π = 2 and P_w = 3."""
 
 
 @pytest.mark.parametrize(
     "script, expected",
     [
-        # Worse: C_π counts, and the third time in a row exceeds P_π = 2.
-        ([(WORSE, MOVING)] * 4, [("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0), ("keep", 1, 0)]),
-        # A better episode in between restarts C_π.
-        (
-            [(WORSE, MOVING)] * 2 + [(BETTER, MOVING)] + [(WORSE, MOVING)] * 3,
-            [("keep", 1, 0), ("keep", 2, 0), ("keep", 0, 0), ("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0)],
-        ),
-        # Better and stalled: C_w counts, and the fourth time in a row exceeds P_w = 3.
-        (
-            [(BETTER, STALLED)] * 5,
-            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("clone", 0, 0), ("keep", 0, 1)],
-        ),
-        # Movement restarts C_w.
-        (
-            [(BETTER, STALLED)] * 3 + [(BETTER, MOVING), (BETTER, STALLED)],
-            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 0, 0), ("keep", 0, 1)],
-        ),
-        # So does a worse live policy: the branch of the clone is not reached, stalled or not.
-        (
-            [(BETTER, STALLED)] * 3 + [(WORSE, STALLED), (BETTER, STALLED)],
-            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 1, 0), ("keep", 0, 1)],
-        ),
-        # Equal costs are not worse; a change equal to T_w is no stall.
-        ([(EQUAL, MOVING), (EQUAL, 0.5), (EQUAL, 0.4999)], [("keep", 0, 0), ("keep", 0, 0), ("keep", 0, 1)]),
-        # A little more is worse.
-        ([((0.99, 1.0), MOVING), ((1.01, 1.0), MOVING)], [("keep", 0, 0), ("keep", 1, 0)]),
+        ([WORSE] * 6, SWAP * 2),
+        # A better episode in between restarts C_π, and movement C_w.
+        ([WORSE] * 2 + [BETTER] + [WORSE] * 3, ["keep"] * 3 + SWAP),
+        ([STALLED] * 8, CLONE * 2),
+        ([STALLED] * 3 + [BETTER] + [STALLED] * 4, ["keep"] * 4 + CLONE),
+        # A worse live policy restarts C_w: the branch of the clone is not reached, stalled or not.
+        ([STALLED] * 3 + [(2.0, 1.0, 0.1)] + [STALLED] * 4, ["keep"] * 4 + CLONE),
+        # Equal costs are not worse, and a change equal to T_w is no stall; a little more or less is.
+        ([(1.0, 1.0, 0.9)] * 4 + [(1.0, 1.0, 0.5)] * 5 + [(1.0, 1.0, 0.4999)] * 4, ["keep"] * 9 + CLONE),
+        ([(0.99, 1.0, 0.9)] * 3 + [(1.01, 1.0, 0.9)] * 3, ["keep"] * 3 + SWAP),
         # An infinite cost is worse than any other.
-        ([((math.inf, 1.0), MOVING), ((1.0, math.inf), MOVING)], [("keep", 1, 0), ("keep", 0, 0)]),
+        ([(math.inf, 1.0, 0.9)] * 3 + [(1.0, math.inf, 0.9)] * 3, SWAP + ["keep"] * 3),
     ],
 )
 def test_every_branch(script, expected):
-    assert play(RefereeConfig(), script)[0] == expected
+    referee = DecisionTree(RefereeConfig(), live="model_free")
+    assert [referee.decide(Evidence(*evidence)) for evidence in script] == expected
+    assert referee.live == ("model_based" if expected.count("swap") == 1 else "model_free")

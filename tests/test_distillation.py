@@ -7,11 +7,9 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
 from test_algorithm import LEARNING, STEPS, flown, twinning, weights
 
-from rt_torchrl import DigitalTwin, SaturatedAffine, SaturatedMLP, Scenario
-from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.config import ExogenousConfig, RefereeConfig
-from rt_torchrl.steps.imitation import Imitation
-from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl import SaturatedAffine, SaturatedMLP
+from rt_torchrl.steps.belief import Judged
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.report import same_architecture
 from rt_torchrl.steps.switch import other_than
 
@@ -27,18 +25,6 @@ def affine(*rows):
 
 def perceptron(seed=1):
     return SaturatedMLP(2, PLANT.actions, hidden=(16, 16), generator=seeded(seed))
-
-
-def draw(count=5, seed=2):
-    generator = seeded(seed)
-    return Scenario(PLANT.draw_initial_state(count, generator), PLANT.draw_exogenous(count, generator))
-
-
-def imitation():
-    virtual = VirtualEpisodes(
-        DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), ExogenousConfig(), 1, generator=seeded(0)
-    )
-    return Imitation(Belief({}, virtual), 5)
 
 
 def two_architectures(**options):

@@ -75,24 +75,18 @@ def test_a_twin_that_diverges_with_the_earlier_closure_too_does_not_end_the_trai
     assert torch.equal(weights(found.policies["model_based"]), before)
 
 
-def flying(found, monkeypatch, diverging):
-    """Let the twin diverge under the policies of these modules, wherever virtual episodes are flown."""
-    cost = found.twin.cost
-
-    def checked(policy, *episodes):
-        if any(policy is module for module in diverging):
-            raise DivergenceError("plant 'linear_quadratic' diverged")
-        return cost(policy, *episodes)
-
-    monkeypatch.setattr(found.twin, "cost", checked)
-
-
 @pytest.mark.parametrize("live, idle", [("model_free", "model_based"), ("model_based", "model_free")])
 def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch, live, idle):
     """The closure that was just found stays, the training goes on, and the live policy stays live."""
     found = twinning(referee=RefereeConfig(patience=0))
-    found.referee.live = live
-    flying(found, monkeypatch, [found.policies[idle]])
+    found.referee.live, cost = live, found.twin.cost
+
+    def checked(policy, *episodes):
+        if policy is found.policies[idle]:
+            raise DivergenceError("plant 'linear_quadratic' diverged")
+        return cost(policy, *episodes)
+
+    monkeypatch.setattr(found.twin, "cost", checked)
     report = found.episode()
     assert report["closure_refused"] == 0.0 and found.referee.live == live
     assert report[f"J_a_{idle}"].isinf() and report[f"J_a_{live}"].isfinite()
@@ -100,17 +94,22 @@ def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch
     assert report["plan_accepted"] == 0.0 or idle == "model_free"
 
 
+def ruined_by(half, method, policy, monkeypatch):
+    """Let a method leave finite weights under which the states overflow."""
+    right = getattr(half, method)
+
+    def ruined(*arguments):
+        report = right(*arguments)
+        fill(policy, 1e9)
+        return report
+
+    monkeypatch.setattr(half, method, ruined)
+
+
 def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monkeypatch):
     """The weights that flew are sound; those that step 2 made of them diverge, cost infinitely much and lose."""
     found = twinning(referee=RefereeConfig(rule="decision_tree", patience=0))
-    update = found.learner.update
-
-    def ruined():
-        report = update()
-        fill(found.policies["model_free"], 1e9)
-        return report
-
-    monkeypatch.setattr(found.learner, "update", ruined)
+    ruined_by(found.learner, "update", found.policies["model_free"], monkeypatch)
     report = found.episode()
     assert report["closure_refused"] == 0.0 and report["J_a_model_free"].isinf()
     assert report["event"] == "swap" and found.referee.live == "model_based"
@@ -118,46 +117,36 @@ def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monke
 
 
 def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch):
-    found, before = twinning(), {}
-    plan = found.planner.plan
-
-    def wild(episodes):
-        before["weights"] = weights(found.policies["model_based"])
-        descended = plan(episodes)
-        fill(found.policies["model_based"], 1e9)  # finite weights under which the states overflow
-        return descended
-
-    monkeypatch.setattr(found.planner, "plan", wild)
+    found = twinning()
+    before = weights(found.policies["model_based"])
+    ruined_by(found.planner, "plan", found.policies["model_based"], monkeypatch)
     report = found.episode()
     assert report["plan_accepted"] == 0.0 and report["closure_refused"] == 0.0
-    assert torch.equal(weights(found.policies["model_based"]), before["weights"])
+    assert torch.equal(weights(found.policies["model_based"]), before)
     assert report["J_a_model_based"].isfinite()
 
 
 @pytest.mark.parametrize("closures", [0, 1])
 def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closures):
     """Neither in the first plan, nor in that which repeats it with an earlier closure."""
-    found = twinning()
-    before, left, planned = weights(found.policies["model_based"]), closures, False
+    found, planned = twinning(), []
+    before = weights(found.policies["model_based"])
 
     def interrupted(episodes):
-        nonlocal left, planned
-        torch.nn.init.zeros_(found.policies["model_based"].gain)
-        left, planned = left - 1, True
-        raise KeyboardInterrupt if left < 0 else DivergenceError("the twin diverged")
-
-    monkeypatch.setattr(found.planner, "plan", interrupted)
+        fill(found.policies["model_based"], 0.0)
+        planned.append("unsound")
+        raise KeyboardInterrupt if len(planned) > closures else DivergenceError("the twin diverged")
 
     def unsound_twin(*arguments):
-        nonlocal planned
-        if planned:
-            planned = False
+        if planned and planned[-1] == "unsound":
+            planned[-1] = "told"
             raise DivergenceError("the twin diverged under what has flown")
 
+    monkeypatch.setattr(found.planner, "plan", interrupted)
     monkeypatch.setattr(found.belief, "require_sound_twin", unsound_twin)
     with pytest.raises(KeyboardInterrupt):
         found.episode()
-    assert left == -1 and torch.equal(weights(found.policies["model_based"]), before)
+    assert len(planned) == closures + 1 and torch.equal(weights(found.policies["model_based"]), before)
 
 
 @pytest.mark.parametrize("method", ["adam", "levenberg_marquardt"])

@@ -65,9 +65,8 @@ def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
 
 def test_samples_have_the_mean_of_the_record():
     """Gusts are skewed: the regression, which follows the median rather than the mean, leaves residuals of one sign."""
-    record = torch.stack(
-        [torch.as_tensor(10.0 + np.exp(autoregressive(600, rho, seed))) for seed, rho in enumerate((0.9, 0.98))], -1
-    )
+    gusts = [np.exp(autoregressive(600, rho, seed)) for seed, rho in enumerate((0.9, 0.98))]
+    record = torch.as_tensor(10.0 + np.stack(gusts, -1))
     found = process(record, signals=FREE * 2)
     torch.testing.assert_close(found.mean.mean(0), record.mean(0), rtol=1e-12, atol=0)
     count = 4000
@@ -92,27 +91,19 @@ def bivariate(n, rho, lag, correlation, seed=0):
     return np.stack([first[lag:], 3.0 * second[:n]], -1)
 
 
-LAGS = (-8, -4, -1, 0, 1, 4, 8)
-
-
-def cross_covariance(found, h):
-    """Covariance of the first component, h samples later, with the second."""
-    return (found.covariance[abs(h)] if h >= 0 else found.covariance[abs(h)].T)[0, 1].item()
-
-
 @pytest.mark.parametrize("correlation, lag", [(0.8, 0), (-0.5, 4)])
 def test_components_keep_their_correlation(correlation, lag):
     """E ε_0(t + h) ε_1(t) of a known bivariate process; fast beside the knots."""
     found = process(bivariate(14_400, 0.5, lag, correlation), FREE * 2)
     # The block means that the large scale follows hold 3ish/48 of the variance; estimating adds 2 % (14 400 samples
     # with a correlation time of 3): 10 % of the variance, which is 1 and 9.
-    lags = torch.arange(6, dtype=torch.float64)
     for k, variance in enumerate((1.0, 9.0)):
-        expected = variance * 0.5**lags
+        expected = variance * 0.5 ** torch.arange(6, dtype=torch.float64)
         torch.testing.assert_close(found.covariance[:6, k, k], expected, rtol=0, atol=0.1 * variance)
     size = found.covariance[0].diagonal().prod().sqrt().item()
-    for h in LAGS:
-        assert cross_covariance(found, h) / size == pytest.approx(correlation * 0.5 ** abs(h + lag), abs=0.1), h
+    for h in (-8, -4, -1, 0, 1, 4, 8):  # the first component, h samples later, with the second
+        covariance = found.covariance[abs(h)] if h >= 0 else found.covariance[abs(h)].T
+        assert covariance[0, 1].item() / size == pytest.approx(correlation * 0.5 ** abs(h + lag), abs=0.1), h
 
 
 def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
@@ -133,28 +124,28 @@ def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
     assert (standard.abs() > 2.576).double().mean().item() == pytest.approx(0.01, abs=5e-4)
 
 
+def virtual_of(plant, large_scale="met"):
+    config = ExogenousConfig(large_scale=large_scale)
+    return VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 3, generator=seeded())
+
+
 def test_large_scales_are_mixed_from_the_third_episode_on():
     plant = WindTurbine(horizon=60.0)
-    levels, seen = (8.0, 11.0, 14.0), {}
-    for count in (2, 3):
-        config = ExogenousConfig(large_scale="mixed")
-        virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 3, generator=seeded())
-        for level in levels[:count]:
-            record = torch.full((plant.n_steps, 1), level, dtype=torch.float64)
-            virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.inputs))
-        seen[count] = virtual.draw(200).exogenous[..., 0]
-    assert {round(value, 6) for value in seen[2].mean(1).tolist()} == {8.0, 11.0}
-    new = seen[3].mean(1)
+    virtual, seen = virtual_of(plant, "mixed"), []
+    for level in (8.0, 11.0, 14.0):
+        record = torch.full((plant.n_steps, 1), level, dtype=torch.float64)
+        virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.inputs))
+        seen.append(virtual.draw(200).exogenous[..., 0])
+    assert {round(value, 6) for value in seen[1].mean(1).tolist()} == {8.0, 11.0}
+    new = seen[2].mean(1)
     assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
     low, high = plant.inputs[0].low, plant.inputs[0].high
-    assert (seen[3] >= low).all() and (seen[3] <= high).all()
+    assert (seen[2] >= low).all() and (seen[2] <= high).all()
 
 
 def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():
     plant = WindTurbine(horizon=60.0, observe=("preview",))
-    virtual = VirtualEpisodes(
-        DigitalTwin(plant, plant.closure), ExogenousConfig(large_scale="drawn"), 3, generator=seeded()
-    )
+    virtual = virtual_of(plant, "drawn")
     record = torch.full((plant.n_steps, 1), 5.0, dtype=torch.float64)
     virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.acting_inputs))
     episodes, generator = virtual.draw(200), seeded()
@@ -200,9 +191,8 @@ def test_an_integral_of_the_controller_is_no_equation_of_the_plant():
 
 def test_set_points_are_drawn_by_the_plant_although_some_were_met():
     plant = SetPoint(horizon=2.0)
-    twin = DigitalTwin(plant, plant.closure)
-    assert set_points(twin, torch.device("cpu")).tolist() == [False, True]
-    virtual = VirtualEpisodes(twin, ExogenousConfig(), 3, generator=seeded())
+    virtual = virtual_of(plant)
+    assert set_points(virtual.twin, torch.device("cpu")).tolist() == [False, True]
     (record,) = flown(plant, seeded(), (plant.n_steps,))
     virtual.learn(record)
     spread = (virtual.draw(200).exogenous[:, -1] - record.exogenous[-1]).std(0)
