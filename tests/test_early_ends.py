@@ -6,51 +6,31 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
-from seeds_and_numbers import drawn
+from seeds_and_numbers import drawn, seeded
 from small_runs import SMALL
 from test_anchored import replays_on
 from test_classical import PD
+from test_collectors import compare, system
 from test_learn import values
 from test_real_system import Rig, connected
 
-from rt_torchrl import (
-    DigitalTwin,
-    FirstController,
-    OperatingLimits,
-    PlannerConfig,
-    PlantEnv,
-    ReinforcementTwinning,
-    SafetyConfig,
-    SafetyLayer,
-    SaturatedMLP,
-    check_plant,
-)
+import rt_torchrl as rt
 from rt_torchrl.control.command_cost import CommandCost
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.figures import figures_of
-from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.optimisers.descent import Descended, DescentConfig
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, LearnerConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.interact import RealFlights
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.config import OperatingLimitsConfig
-from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.trajectory import (
-    Scenario,
-    Trajectory,
     batch_of,
     continued,
-    control_cost,
-    identification_cost,
 )
 
 
@@ -97,12 +77,12 @@ def test_the_cost_of_an_episode_that_ends_is_the_sum_by_hand(engine, gain):
     start, inputs = drawn(plant, 6)
     found = [by_hand(plant, policy, *episode) for episode in zip(start, inputs, strict=True)]
     assert all(n < plant.n_steps for n, _ in found) == (gain is WEAK)
-    rollout = Rollout(plant, plant.closure, policy, engine=engine)
+    rollout = rt.Rollout(plant, plant.closure, policy, engine=engine)
     expected = torch.tensor([cost for _, cost in found], dtype=torch.float64)
     # Rounding of fifty sums.
     torch.testing.assert_close(rollout.costs(start, inputs).detach(), expected, rtol=1e-10, atol=0.0)
     flown = rollout(start, inputs)
-    torch.testing.assert_close(control_cost(plant, flown).detach(), expected, rtol=1e-10, atol=0.0)
+    torch.testing.assert_close(rt.control_cost(plant, flown).detach(), expected, rtol=1e-10, atol=0.0)
     for states, (n, _) in zip(flown.states, found, strict=True):
         assert (states[n:] == states[n]).all()
 
@@ -112,7 +92,7 @@ def test_the_gradient_is_that_of_the_same_end(engine):
     """Between two weights whose episodes end after the same numbers of intervals, the cost is smooth."""
     plant, policy = Falling(), LinearGain(WEAK)
     start, inputs = drawn(plant, 6)
-    rollout = Rollout(plant, plant.closure, policy, engine=engine)
+    rollout = rt.Rollout(plant, plant.closure, policy, engine=engine)
     rollout.costs(start, inputs).mean().backward()
     step = 1e-5
     for k in range(2):
@@ -128,42 +108,26 @@ def test_the_gradient_is_that_of_the_same_end(engine):
         assert policy.gain.grad[0, k].item() == pytest.approx((up - down) / (2 * step), rel=1e-6)
 
 
-def test_an_engine_that_integrates_the_field_is_refused():
-    plant = Falling()
-    with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use one of native"):
-        Rollout(plant, plant.closure, LinearGain(WEAK), engine="odeint_adjoint")
-    with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
-        CommandCost(plant, plant.closure, 10)
-
-
 def actor_of(plant, policy):
-    live = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator().manual_seed(0))
+    live = LivePolicy(plant, policy, rt.ExplorationConfig(), generator=seeded())
     live.begin(policy, strength=0.0)
     return live
 
 
 def test_both_collectors_fly_the_same_episode_to_its_end():
-    plant, policy = Falling(), LinearGain(WEAK)
-    one, other = (
-        kind(env, actor_of(plant, policy), *rest).rollout()
-        for kind, env, rest in (
-            (FlightCollector, PlantEnv(plant, seed=1), ()),
-            (EpisodeCollector, PlantEnv(plant, seed=1), (plant,)),
-        )
-    )
-    assert one.shape == other.shape and one.shape[1] < plant.n_steps
-    assert one["next", "terminated"].flatten().tolist() == [False] * (one.shape[1] - 1) + [True]
-    ends = [("next", key) for key in ("reward", "done", "terminated", "truncated", "exogenous", "observation")]
-    for key in ("state", "observation", "action", *ends):
-        # Machine code rounds differently.
-        torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-12)
+    env, actor, policy = system(Falling())
+    actor.begin(policy, strength=0.0)
+    flown = FlightCollector(env, actor).rollout()
+    n = flown.shape[1]
+    assert flown["next", "terminated"].flatten().tolist() == [False] * (n - 1) + [True] and n < env.plant.n_steps
+    compare(lambda: system(Falling()), rtol=1e-12, atol=1e-12)
 
 
 def test_sums_of_rewards_end_with_the_known_value_of_the_end():
     plant = Falling()
-    config = LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, batch_size=8)
-    learner = ActorCritic(plant, LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
-    episode = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, LinearGain(WEAK)), plant).rollout()[0]
+    config = rt.LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, batch_size=8)
+    learner = ActorCritic(plant, LinearGain(WEAK), config, generator=seeded())
+    episode = EpisodeCollector(rt.PlantEnv(plant, seed=1), actor_of(plant, LinearGain(WEAK)), plant).rollout()[0]
     found, n = learner.transitions(episode), len(episode)
     rewards = episode["next", "reward"].flatten().tolist()
     after = [-plant.end_cost] * 3000  # 0.9 to this power is zero
@@ -179,49 +143,36 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
 
 
-def algorithm(env, plant, config=SMALL, closure=None):
-    generator = torch.Generator().manual_seed(0)
-    twin = DigitalTwin(plant, plant.make_closure(generator) if closure is None else closure)
-    policies = {role: LinearGain(WEAK) for role in ("model_free", "model_based")}
-    return ReinforcementTwinning(env, twin, **policies, config=config, generator=generator)
+def algorithm(env, plant, config=SMALL, **parts):
+    generator, policies = seeded(), {role: LinearGain(WEAK) for role in ("model_free", "model_based")}
+    twin = rt.DigitalTwin(plant, plant.make_closure(generator))
+    return rt.ReinforcementTwinning(env, twin, **policies, config=config, generator=generator, **parts)
 
 
-@pytest.mark.parametrize("system", [pytest.param("simulation", marks=pytest.mark.slow), "real"])
-def test_a_training_learns_from_episodes_of_unequal_length(system):
+def test_a_training_learns_from_episodes_of_unequal_length():
     plant = Falling(noise=0.01)
-    config = dataclasses.replace(
-        SMALL,
-        records=2,
-        assimilation=AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt"),
-        planner=PlannerConfig(iterations=30, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-    )
-    env = PlantEnv(plant, seed=1) if system == "simulation" else connected(plant, rig=Rig(plant, seed=1))
+    fit = rt.AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt")
+    planner = rt.PlannerConfig(iterations=30, descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0))
+    config = dataclasses.replace(SMALL, records=2, assimilation=fit, planner=planner)
+    env = connected(plant, rig=Rig(plant, seed=1))
     found = algorithm(env, plant, config)
-    reports = [found.episode()]
+    first = found.episode()
     resumed = algorithm(env, plant, config)
     resumed.load_state_dict(found.state_dict())
-    snapshot = Snapshot.take(
-        resumed, plant.make_closure(torch.Generator().manual_seed(0)), [episode_record(reports[0], episode=0)]
-    )
-    n = len(found.short_term[-1].actions)
+    snapshot = rt.Snapshot.take(resumed, plant.make_closure(seeded()), [episode_record(first, episode=0)])
+    n = len(resumed.short_term[-1].actions)
     assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
-    if system == "simulation":
-        assert {"states", "exogenous"} <= figures_of(snapshot).keys()
-    reports += [found.episode() for _ in range(4)]
+    last = [found.episode() for _ in range(4)][-1]
     lengths = [len(flown.trajectory.actions) for flown in found.belief.flown]
-    first = reports[0]
-    assert lengths[0] == first["ended_after"] < plant.n_steps and len(set(lengths)) > 1
-    record, n = found.belief.flown[0].trajectory, lengths[0]
+    assert lengths[0] == first["ended_after"] == n and len(set(lengths)) > 1
+    record = found.belief.flown[0].trajectory
     t = plant.dt * torch.arange(n).double()
     running = plant.running_cost(t, record.states[:-1], record.actions, record.exogenous).sum()
     expected = (running + (plant.n_steps - n) * plant.end_cost) / plant.n_steps
     assert first["real_cost"].item() == pytest.approx(expected.item(), rel=1e-9)
     # Records of unequal length, without noise of sensors, say all of four weights.
     torch.testing.assert_close(found.twin.closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-4)
-    assert "ended_after" not in reports[-1] and reports[-1]["real_cost"] < 0.1 * first["real_cost"]
-    other = algorithm(env, plant, config)
-    other.load_state_dict(found.state_dict())
-    assert [len(record.actions) for record in other.short_term] == lengths[-2:]
+    assert "ended_after" not in last and last["real_cost"] < 0.1 * first["real_cost"]
 
 
 def test_a_training_learns_from_episodes_that_end_at_once():
@@ -231,7 +182,7 @@ def test_a_training_learns_from_episodes_that_end_at_once():
         A = ((0.0, 1.0), (100.0, 0.0))
 
     checked = list[int]()
-    found = algorithm(PlantEnv(Brittle(), seed=2), Brittle())
+    found = algorithm(rt.PlantEnv(Brittle(), seed=2), Brittle())
     found.flights.check = lambda record: checked.append(len(record.actions))
     reports = [found.episode() for _ in range(3)]
     lengths = [int(report["ended_after"]) for report in reports]
@@ -251,35 +202,32 @@ class Tripping(Falling):
         return (state[..., 0] - 0.49) ** 2 + 0.01 * applied.square().sum(-1)
 
 
+class Pushing(LinearGain):
+    def forward(self, observation):
+        push, damping = self.gain.unbind(-1)
+        return push + 0.0 * observation[..., :1] - damping * observation[..., 1:2]
+
+
 def test_few_weights_are_searched_on_where_gradients_do_not_see_an_end(monkeypatch):
     """Gradients lead the rod into the trip, beyond which nothing changes; the search stays before it."""
 
-    class Pushing(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.push = torch.nn.Parameter(torch.tensor([0.1, 0.1]).double())
-
-        def forward(self, observation):
-            return (self.push[:1] + 0.0 * observation[..., :1]) - self.push[1:] * observation[..., 1:2]
+    def planner_of(plant, **options):
+        return WholeEpisodes(rt.DigitalTwin(plant, plant.closure), Pushing([[0.1, 0.1]]), rt.PlannerConfig(**options))
 
     plant, costs = Tripping(noise=0.0), {}
-    episodes = Scenario(torch.zeros(4, 2).double(), plant.draw_exogenous(4, torch.Generator().manual_seed(0)))
+    episodes = rt.Scenario(torch.zeros(4, 2).double(), plant.draw_exogenous(4, seeded()))
     for searches in (False, True):
-        planner = WholeEpisodes(DigitalTwin(plant, plant.closure), Pushing(), PlannerConfig(iterations=30))
+        planner = planner_of(plant, iterations=30)
         assert [weight.numel() for weight in planner.searched] == [2]
         monkeypatch.setattr(planner, "searched", planner.searched if searches else [])
         report = planner.plan(episodes)
-        flown = planner.twin.control(planner.policy, *episodes)
-        costs[searches] = control_cost(plant, flown).mean().item()
+        costs[searches] = planner.twin.cost(planner.policy, *episodes).item()
         assert report.best == pytest.approx(costs[searches])
     assert costs[True] < 0.97 * costs[False]
-    idle = WholeEpisodes(planner.twin, Pushing(), PlannerConfig(iterations=0))
+    idle = planner_of(plant, iterations=0)
     idle.plan(episodes)
-    assert torch.equal(idle.policy.push, Pushing().push)
-    paper = WholeEpisodes(DigitalTwin(plant, plant.closure), Pushing(), PlannerConfig(method="single_start"))
-    endless = LinearQuadratic()
-    smooth = WholeEpisodes(DigitalTwin(endless, endless.closure), Pushing(), PlannerConfig())
-    assert not (paper.searched or smooth.searched)
+    assert idle.policy.gain.tolist() == [[0.1, 0.1]]
+    assert not planner_of(plant, method="single_start").searched and not planner_of(LinearQuadratic()).searched
 
 
 @pytest.mark.parametrize(
@@ -287,27 +235,25 @@ def test_few_weights_are_searched_on_where_gradients_do_not_see_an_end(monkeypat
 )
 def test_of_many_weights_those_of_the_output_layer_are_searched(hidden, sizes, monkeypatch):
     plant = Falling()
-    policy = SaturatedMLP(2, plant.actions, hidden=hidden, generator=torch.Generator().manual_seed(0))
-    planner = WholeEpisodes(DigitalTwin(plant, plant.closure), policy, PlannerConfig(iterations=2))
+    policy = rt.SaturatedMLP(2, plant.actions, hidden=hidden, generator=seeded())
+    planner = WholeEpisodes(rt.DigitalTwin(plant, plant.closure), policy, rt.PlannerConfig(iterations=2))
     assert [weight.numel() for weight in planner.searched] == sizes
     monkeypatch.setattr(planner.descent, "run", lambda cost, count: Descended(1.0, 1.0, 0.0, 0))
     before = [weight.detach().clone() for weight in policy.parameters()]
-    generator = torch.Generator().manual_seed(0)
-    planner.plan(Scenario(plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)))
+    planner.plan(rt.Scenario(*drawn(plant, 3)))
     changed = [not torch.equal(*pair) for pair in zip(before, policy.parameters(), strict=True)]
     assert changed == [False] * (len(before) - len(sizes)) + [True] * len(sizes)
 
 
-def test_policies_are_judged_in_many_episodes_where_ends_are_rare():
-    usual = SMALL.virtual_episodes
-    for plant, method, times in (
-        (Falling(), "multi_start", 20),
-        (Falling(), "single_start", 1),
-        (LinearQuadratic(), "multi_start", 1),
-    ):
-        config = dataclasses.replace(SMALL, planner=PlannerConfig(method=method))
-        steps = algorithm(PlantEnv(plant), plant, config).steps
-        assert {steps["interact"].judged, steps["plan"].judged, steps["learn"].count} == {times * usual}
+@pytest.mark.parametrize(
+    ("kind", "method", "times"),
+    [(Falling, "multi_start", 20), (Falling, "single_start", 1), (LinearQuadratic, "multi_start", 1)],
+)
+def test_policies_are_judged_in_many_episodes_where_ends_are_rare(kind, method, times):
+    config = dataclasses.replace(SMALL, planner=rt.PlannerConfig(method=method))
+    steps = algorithm(rt.PlantEnv(kind()), kind(), config).steps
+    counts = steps["interact"].judged, steps["plan"].judged, steps["learn"].count
+    assert counts == (times * SMALL.virtual_episodes,) * 3
 
 
 def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
@@ -329,18 +275,12 @@ def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
             return {}
 
     plant, planner = Falling(noise=0.0), Greedy()
-    virtual = VirtualEpisodes(
-        DigitalTwin(plant, plant.closure), ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0)
-    )
-    still = torch.zeros(12, plant.n_steps, 1).double()
-    planned_on = Scenario(torch.zeros(3, 2).double(), still[:3])
-    judged_on = Scenario(
-        torch.zeros(12, 2)
-        .double()
-        .index_put((torch.tensor(7), torch.tensor(0)), torch.tensor(0.9, dtype=torch.float64)),
-        still,
-    )
-    report = MultiStart(planner, Belief({}, virtual), PlannerConfig()).plan(1, planned_on, judged_on)
+    virtual = VirtualEpisodes(rt.DigitalTwin(plant, plant.closure), rt.ExogenousConfig(), 1, generator=seeded())
+    starts, still = torch.zeros(12, 2).double(), torch.zeros(12, plant.n_steps, 1).double()
+    planned_on = rt.Scenario(starts[:3].clone(), still[:3])
+    starts[7, 0] = 0.9
+    planning = MultiStart(planner, Belief({}, virtual), rt.PlannerConfig())
+    report = planning.plan(1, planned_on, rt.Scenario(starts, still))
     assert [len(starts) for starts in planner.seen] == [3, 8] and planner.seen[1][3] == 0.9
     assert planner.policy.gain.tolist() == STRONG and report["plan_accepted"] == 1.0
 
@@ -354,33 +294,20 @@ def test_an_end_where_the_plant_has_none_is_refused():
         found.episode()
 
 
-def test_a_plant_that_ends_at_no_cost_is_refused():
-    class Free(Falling):
-        end_cost = None
-
+def test_what_does_not_go_with_ends_is_refused(tmp_path):
+    plant, free, begun = Falling(), Falling(), Falling()
+    free.end_cost, begun.reach = None, 0.0
     with pytest.raises(ValueError, match=r"'falling' defines ended\(\) and no end_cost"):
-        DigitalTwin(Free(), LinearClosure(Free.true_closure))
-    with pytest.raises(ValueError, match=r"end_cost: plant 'falling' defines ended\(\) and no end_cost"):
-        check_plant(Free(), steps=5, traced=False)
-
-    class Vague(Falling):
-        def ended(self, state):
-            return state[..., :1].abs() > self.reach
-
-    with pytest.raises(ValueError, match=r"ended: returns torch.bool of shape \(5, 4, 1\)"):
-        check_plant(Vague(), steps=5, traced=False)
-
-    class Begun(Falling):
-        reach = 0.0
-
+        rt.DigitalTwin(free, free.closure)
     with pytest.raises(ValueError, match="draws initial states in which the episode has ended"):
-        PlantEnv(Begun()).reset()
-
-
-def test_windows_of_operation_are_refused(tmp_path):
-    config = RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
+        rt.PlantEnv(begun).reset()
+    with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use one of native"):
+        rt.Rollout(plant, plant.closure, LinearGain(WEAK), engine="odeint_adjoint")
+    with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
+        CommandCost(plant, plant.closure, 10)
+    config = rt.RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
     with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
-        operation_of(config, PlantEnv(Falling()), None, Falling(), {})
+        operation_of(config, rt.PlantEnv(plant), None, plant, {})
 
 
 def test_the_plant_of_the_documentation_breaks_its_rod():
@@ -388,9 +315,9 @@ def test_the_plant_of_the_documentation_breaks_its_rod():
     exec(compile("\n".join(blocks("real_system.md", "python")), "docs/real_system.md", "exec"), scope)
     plant = scope["Fragile"]()
     assert plant.ended(torch.tensor([[3.0, -7.6], [7.6, 7.4]]).double()).tolist() == [True, False]
-    start, inputs = plant.draw_initial_state(3, torch.Generator().manual_seed(0)), torch.zeros(3, 5, 0).double()
-    flown = Trajectory(torch.full((3, 6, 2), 8.0).double(), torch.zeros(3, 5, 1).double(), inputs)
-    assert control_cost(plant, flown).tolist() == [20.0] * 3 and not plant.ended(start).any()
+    start, inputs = plant.draw_initial_state(3, seeded()), torch.zeros(3, 5, 0).double()
+    flown = rt.Trajectory(torch.full((3, 6, 2), 8.0).double(), torch.zeros(3, 5, 1).double(), inputs)
+    assert rt.control_cost(plant, flown).tolist() == [20.0] * 3 and not plant.ended(start).any()
 
 
 def test_inputs_are_continued_without_a_jump():
@@ -409,25 +336,18 @@ def test_a_twin_is_compared_with_an_episode_to_its_end():
     for episode in flown.each():
         n = int(plant.ended(episode.states).int().argmax())
         flight = batch_of([episode.part(0, n, plant.dt)])
-        replayed = Rollout(plant, wrong)(flight.states[:, 0], flight.exogenous, flight.actions)
-        expected.append(identification_cost(plant, replayed, flight.states))
+        replayed = rt.Rollout(plant, wrong)(flight.states[:, 0], flight.exogenous, flight.actions)
+        expected.append(rt.identification_cost(plant, replayed, flight.states))
     torch.testing.assert_close(unseen.identification_costs(plant, wrong, flown), torch.cat(expected))
 
 
 def begun():
     """The algorithm after a flight of a controller under which the rod falls."""
-    plant, generator = Falling(noise=0.01), torch.Generator().manual_seed(0)
-    limits = OperatingLimitsConfig(states={"velocity": (-0.5, 0.5)})
-    safety = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
-    policies = {role: LinearGain(WEAK) for role in ("model_free", "model_based")}
-    return ReinforcementTwinning(
-        SafetyLayer(PlantEnv(plant, seed=1), safety, fallback=(0.0,)),
-        DigitalTwin(plant, plant.make_closure(generator)),
-        **policies,
-        config=dataclasses.replace(SMALL, limits=limits),
-        generator=generator,
-        first=FirstController(PD(plant, (1.0, 0.1))),
-    )
+    plant, limits = Falling(noise=0.01), rt.OperatingLimitsConfig(states={"velocity": (-0.5, 0.5)})
+    safety = rt.SafetyConfig(interval=plant.dt, **rt.OperatingLimits(plant, limits).safety())
+    layer = rt.SafetyLayer(rt.PlantEnv(plant, seed=1), safety, fallback=(0.0,))
+    first = rt.FirstController(PD(plant, (1.0, 0.1)))
+    return algorithm(layer, plant, dataclasses.replace(SMALL, limits=limits), first=first)
 
 
 def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch):
@@ -457,8 +377,8 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
 def test_the_anchored_replay_of_an_end_that_noise_hides_costs_what_the_episode_did():
     """The last reading says that the rod has not fallen; the replay falls one interval later."""
     plant, policy = Falling(), LinearGain(WEAK)
-    env, closure = PlantEnv(plant, seed=1), plant.make_closure(torch.Generator().manual_seed(0))
-    flight = RealFlights(env, actor_of(plant, policy), FlightCollector(env, actor_of(plant, policy)).rollout, plant)
+    env, closure, actor = rt.PlantEnv(plant, seed=1), plant.make_closure(seeded()), actor_of(plant, policy)
+    flight = RealFlights(env, actor, FlightCollector(env, actor).rollout, plant)
     flown = flight.fly(policy, strength=0.0, whole=True)
     states = flown.record.states.clone()
     states[-1, 0] = 0.99 * states[-1, 0].sign()
