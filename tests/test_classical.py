@@ -70,26 +70,23 @@ def test_a_law_sees_the_measured_inputs_of_its_interval_in_flights_and_interval_
     torch.testing.assert_close(controller._memory, exogenous.sum(1), rtol=0, atol=1e-12)
 
 
-class Wild(ClassicalController):
+class Wild(PD):
     """A law that asks for what is no number."""
 
     def law(self, state, memory, exogenous):
         return torch.nan * state[:, :1], memory
 
 
-def test_a_flight_that_diverges_is_refused():
+def test_a_flight_that_diverges_is_refused_and_one_of_an_unknown_system():
     plant = LinearQuadratic(horizon=3.0)
     with pytest.raises(DivergenceError, match=r"diverged .* at t = 0.1 s: .* LinearClosure and Wild"):
         Wild(plant).fly(*episodes(plant))
     with pytest.raises(DivergenceError, match="gains that hold the system"):
         PD(plant).fly(*episodes(plant), LinearClosure(torch.full((2, 2), 1e9)))
-
-
-def test_a_system_whose_closure_nobody_knows_is_flown_by_no_controller():
-    unseen = UnseenEpisodes(LinearQuadratic(horizon=3.0), 2)
+    unseen = UnseenEpisodes(plant, 2)
     unseen.closure = None
     with pytest.raises(ValueError, match="is not known"):
-        unseen.fly(PD(unseen.plant))
+        unseen.fly(PD(plant))
 
 
 def test_a_baseline_that_diverges_does_not_take_the_results():

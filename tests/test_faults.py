@@ -1,18 +1,16 @@
 """Faults of the real system: what is kept of the episode, what the record says, and that the training goes on."""
 
-import json
-
 import pytest
 import torch
 from faulty_system import FaultySystem, Injection
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from small_runs import SMALL
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_algorithm import twinning
 from test_classical import PD
 
-from rt_torchrl import DigitalTwin, FirstController, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
-from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl import FirstController, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -113,9 +111,8 @@ def test_an_episode_that_ends_early_is_kept_up_to_there(kind, records):
 
 
 def test_faults_of_the_flight_that_a_training_begins_with_are_in_its_first_episode():
-    plant = LinearQuadratic(horizon=DT * N)
     env = guarded(Injection("late", 8, episode=0, value=0.6), Injection("raises", 30, episode=1))
-    found = algorithm(env, first=FirstController(PD(plant)))
+    found = algorithm(env, first=FirstController(PD(LinearQuadratic(horizon=DT * N))))
     found.episode()
     assert [fault.kind for fault in found.flights.faults] == ["late", "ended"]
     found.episode()
@@ -131,10 +128,12 @@ def test_too_little_of_an_episode_is_flown_again():
     assert len(found.learner.memory) == 2 * N
 
 
+FIRST = Injection("raises", 38, episode=0)
+
+
 def test_the_first_episode_is_whole():
-    found = algorithm(guarded(Injection("raises", 38, episode=0)))
+    found, alone = (algorithm(guarded(FIRST), arm=arm) for arm in ("twinning", "model_free"))
     assert found.episode()["episodes_refused"] == 1 and len(found.short_term[-1].actions) == N
-    alone = algorithm(guarded(Injection("raises", 38, episode=0)), arm="model_free")
     assert alone.episode()["sound_intervals"] == 38
 
 
@@ -149,9 +148,6 @@ def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     assert "faults" not in episodes[0]
     assert [(fault["kind"], fault["interval"]) for fault in episodes[1]["faults"]] == [("not finite", 8)]
     assert episodes[2]["faults"][0]["time"] == pytest.approx(3.0) and episodes[2]["sound_intervals"] == 30
-    assert json.loads((tmp_path / "metrics.json").read_text())["episodes"] == episodes
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     shown = EventAccumulator(str(tmp_path))
     shown.Reload()
     assert [event.value for event in shown.Scalars("faults/not finite")] == [1.0]
@@ -171,11 +167,9 @@ PLANTS = {
 )
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost):
-    plant, generator = PLANTS[name](), torch.Generator().manual_seed(0)
+    plant = PLANTS[name]()
     layer = guarded(injection, plant=plant)
-    policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
-    twin = DigitalTwin(plant, plant.make_closure(generator))
-    found = ReinforcementTwinning(layer, twin, **policies, config=SMALL, generator=generator)
+    found = twinning(plant, env=layer, hypotheses=SMALL.hypotheses)
     reports = [found.episode() for _ in range(3)]
     kinds = [{key for key in report.keys() if key.startswith("faults/")} for report in reports]  # noqa: SIM118
     last = injection.first if injection.last is None else injection.last
