@@ -1,5 +1,6 @@
 """Why a policy is poor: each reason in a run of which it is true, and in one of which it is not."""
 
+import dataclasses
 import json
 import shutil
 from dataclasses import field
@@ -9,19 +10,8 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 
-from rt_torchrl import (
-    ClassicalController,
-    ExplorationConfig,
-    PlannerConfig,
-    PredictiveConfig,
-    Run,
-    RunConfig,
-    TwinningConfig,
-    diagnose,
-    load_run,
-)
+import rt_torchrl as rt
 from rt_torchrl.options import configuration
-from rt_torchrl.runs.diagnosis import Reason
 
 CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST, CHATTER = range(7)
 
@@ -40,8 +30,13 @@ class Pushed(LinearQuadratic):
         return {"mean force [N]": actions.abs().mean((-1, -2))}
 
 
+PLANNER = rt.PlannerConfig(starts=0, receding_horizon=rt.PredictiveConfig(horizon=3.0))
+QUIET = rt.ExplorationConfig(spread=0.0)
+MODEL_BASED = rt.TwinningConfig(arm="model_based", virtual_episodes=50, exploration=QUIET, planner=PLANNER)
+
+
 @configuration
-class Config(RunConfig):
+class Config(rt.RunConfig):
     """A model-based training of two episodes.
 
     Args:
@@ -52,14 +47,7 @@ class Config(RunConfig):
     episodes: int = 2
     unseen: int = 4
     figures: bool = False
-    twinning: TwinningConfig = field(
-        default_factory=lambda: TwinningConfig(
-            arm="model_based",
-            virtual_episodes=50,
-            exploration=ExplorationConfig(spread=0.0),
-            planner=PlannerConfig(starts=0, receding_horizon=PredictiveConfig(horizon=3.0)),
-        )
-    )
+    twinning: rt.TwinningConfig = field(default_factory=lambda: MODEL_BASED)
 
     def plant(self):
         return Pushed(noise=0.01)
@@ -68,7 +56,7 @@ class Config(RunConfig):
         return LinearGain([[0.1, 0.1]]) if self.policy == "full" else Spring([[0.1]])
 
 
-class Still(ClassicalController):
+class Still(rt.ClassicalController):
     """Does nothing."""
 
     def law(self, state, memory, exogenous):
@@ -77,8 +65,8 @@ class Still(ClassicalController):
 
 def finished(folder, **options):
     config = Config(log_dir=folder, **options)
-    Run(config, config.plant(), baselines={"still": Still}).train()
-    return load_run(folder, Config)
+    rt.Run(config, config.plant(), baselines={"still": Still}).train()
+    return rt.load_run(folder, Config)
 
 
 @pytest.fixture(scope="module")
@@ -89,21 +77,25 @@ def trained(tmp_path_factory):
 @pytest.fixture
 def run(trained, tmp_path):
     """A run of its own, whose results may be rewritten."""
-    return load_run(shutil.copytree(trained, tmp_path / "run"), Config)
+    return rt.load_run(shutil.copytree(trained, tmp_path / "run"), Config)
 
 
-def rewrite(run, change):
-    """Let the run have had other results."""
+def rewrite(run, *dropped, baselines=None, **changes):
+    """Let the run have had episodes with other results or without some."""
     metrics = run.metrics
-    change(metrics)
+    metrics["summary"]["unseen"] |= {} if baselines is None else {"baselines": baselines}
+    for episode in metrics["episodes"]:
+        episode |= changes
+        for name in dropped:
+            episode.pop(name, None)
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
 
 
 def test_a_run_that_ended_well_has_no_reason_and_the_user_judges_that_it_acts_more(run):
-    reasons = diagnose(run)
+    reasons = rt.diagnose(run)
     # Ten episodes from random initial states scatter too much to compare them with those of the plan.
     assert [reason.holds for reason in reasons] == [False, False, False, False, None, None, False]
-    assert all(isinstance(reason, Reason) and reason.evidence and reason.remedy for reason in reasons)
+    assert all(reason.evidence and reason.remedy for reason in reasons)
     evidence = reasons[COST].evidence
     assert "judge whether it is better: mean force [N]" in evidence and "against 0 of still" in evidence
 
@@ -112,57 +104,48 @@ def test_a_policy_above_the_least_cost_of_its_class_is_in_a_poor_minimum(run):
     gain = run.policy("model_based").gain
     with torch.no_grad():
         gain.copy_(torch.as_tensor(optimal_gain(1.0)))
-        assert not diagnose(run)[MINIMUM].holds
+        assert not rt.diagnose(run)[MINIMUM].holds
         gain.mul_(0.3)
-    reason = diagnose(run)[MINIMUM]
+    reason = rt.diagnose(run)[MINIMUM]
     assert reason.holds and "with the best weights" in reason.evidence
 
 
 def test_a_gain_that_turns_the_action_over_in_every_interval_chatters(run):
     with torch.no_grad():
         run.policy("model_based").gain.copy_(torch.tensor([[0.0, 30.0]]))
-    reason = diagnose(run, episodes=2)[CHATTER]
+    reason = rt.diagnose(run, episodes=2)[CHATTER]
     assert reason.holds and "force changes by more than half its range" in reason.evidence
 
 
 def test_a_class_that_sees_too_little_is_too_small(tmp_path):
-    reasons = diagnose(finished(tmp_path, policy="spring"))
+    reasons = rt.diagnose(finished(tmp_path, policy="spring"))
     assert reasons[CLASS].holds and not reasons[MINIMUM].holds
 
 
 def test_an_alarm_is_a_twin_that_is_wrong(run):
-    def diverged(metrics):  # under what had flown; then no difference is known
-        metrics["episodes"][-1] |= {"alarm": 1.0, "warning": "the twin diverges"}
-        del metrics["episodes"][-1]["paired_difference"]
-
-    rewrite(run, diverged)
-    reason = diagnose(run)[TWIN]
+    # Under what had flown it diverges, and no difference is known.
+    rewrite(run, "paired_difference", alarm=1.0, warning="the twin diverges")
+    reason = rt.diagnose(run)[TWIN]
     assert reason.holds and reason.evidence == "the twin diverges"
-    rewrite(run, lambda metrics: metrics["episodes"][-1].update(alarm=0.0, warning=None, paired_difference=0.7))
-    reason = diagnose(run)[TWIN]
+    rewrite(run, alarm=0.0, warning=None, paired_difference=0.7)
+    reason = rt.diagnose(run)[TWIN]
     assert reason.holds is False and "cost 2.01 times what the twin says" in reason.evidence
 
 
 @pytest.mark.parametrize(("count", "holds"), [(3, None), (12, True)])
 def test_unseen_episodes_that_cost_more_than_planned_have_other_inputs(run, count, holds):
     """Three episodes from random initial states scatter too much to say so."""
-    rewrite(run, lambda metrics: [entry.update(J_a_plan=1e-3, paired_difference=0.0) for entry in metrics["episodes"]])
-    assert diagnose(run, episodes=count)[INPUTS].holds is holds
+    rewrite(run, J_a_plan=1e-3, paired_difference=0.0)
+    assert rt.diagnose(run, episodes=count)[INPUTS].holds is holds
 
 
 def test_what_a_run_does_not_say_is_no_reason(run):
-    def forget(metrics):
-        metrics["summary"]["unseen"]["baselines"] = {}
-        for entry in metrics["episodes"]:
-            entry.pop("J_a_plan")
-            entry.pop("alarm")
-
-    rewrite(run, forget)
-    reasons = diagnose(run)
+    rewrite(run, "J_a_plan", "alarm", baselines={})
+    reasons = rt.diagnose(run)
     assert [reasons[k].holds for k in (TWIN, INPUTS, COST)] == [None, None, None]
 
 
 def test_predictive_control_has_no_weights_in_a_minimum(tmp_path):
-    planner = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=3.0))
-    reasons = diagnose(finished(tmp_path, twinning=TwinningConfig(arm="model_based", planner=planner)), episodes=2)
+    planner = dataclasses.replace(PLANNER, method="receding_horizon")
+    reasons = rt.diagnose(finished(tmp_path, twinning=dataclasses.replace(MODEL_BASED, planner=planner)), episodes=2)
     assert reasons[MINIMUM].holds is None and not reasons[CLASS].holds
