@@ -10,25 +10,16 @@ from printed_commands import blocks
 from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, room_records
 from test_uncertainty import position
 
-from rt_torchrl import DigitalTwin, Measurement
+from rt_torchrl import DigitalTwin, Measurement, Sensor, sensor_record, sensors_of
 from rt_torchrl.fit.least_squares import Estimation, judged
-from rt_torchrl.fit.sensors import (
-    Sensor,
-    known_sensors,
-    read,
-    read_slopes,
-    segments,
-    sensor_record,
-    sensors_of,
-)
+from rt_torchrl.fit.sensors import known_sensors, read, read_slopes, segments
 
 
 def test_derivatives_are_those_of_backpropagation():
     """Of a nonlinear sensor with a bias, over records of two lengths with holes, against the adjoint's."""
     plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
-    product = Measurement(
-        symbol="p", name="product", unit="m^2/s", read=lambda plant, t, s, z: s[..., 0] * s[..., 1] + t + z[..., 0]
-    )
+    read_product = lambda plant, t, s, z: s[..., 0] * s[..., 1] + t + z[..., 0]  # noqa: E731
+    product = Measurement(symbol="p", name="product", unit="m^2/s", read=read_product)
     sensors = (*sensors_of(plant, ["position"]), Sensor(measurement=product, bias=True))
     twin = DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
     records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (12, 7))]
@@ -134,9 +125,8 @@ def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
 
 
 def test_the_example_of_the_documentation_runs():
-    (code,) = blocks("identify.md", "python")
     names = {}
-    exec(code, names)
+    exec(blocks("identify.md", "python")[0], names)
     estimate, plant = names["estimate"], names["plant"]
     assert estimate.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
     true = plant.closure.named_coefficients()
