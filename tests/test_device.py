@@ -176,17 +176,13 @@ def pretend_device() -> Iterator[torch.device]:
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 # One gradient of each kind makes every kind of tensor.
-ONE_OF_EACH = dataclasses.replace(
-    SMALL,
-    assimilation=AssimilationConfig(iterations=1),
-    planner=PlannerConfig(iterations=1),
-    learner=dataclasses.replace(FULL.learner, critic_iterations=2, actor_iterations=1),
-)
+LEARNER = dataclasses.replace(FULL.learner, critic_iterations=2, actor_iterations=1)
+STEPS = {"assimilation": AssimilationConfig(iterations=1), "planner": PlannerConfig(iterations=1), "learner": LEARNER}
 ESTIMATED = AssimilationConfig(
     iterations=1, method="levenberg_marquardt", inputs="record", initial="estimated", prior=0.1, segment=2
 )
 NEURAL = {"closure": "mlp", "policy": "mlp", "hidden": (4,)}
-TD3 = dataclasses.replace(FULL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
+TD3 = dataclasses.replace(LEARNER, algorithm="td3")
 
 
 @pytest.fixture
@@ -195,38 +191,30 @@ def train(tmp_path, monkeypatch):
 
     def run(recipe, *, twinning=None, **options):
         module = load_recipe(RECIPES / f"{recipe}.py")
-        small = {"episodes": 1, "unseen": 2, "figures": False, "threads": 1}
-        small |= {"device": NAME, "log_dir": tmp_path, "twinning": dataclasses.replace(ONE_OF_EACH, **(twinning or {}))}
+        small = {"episodes": 1, "unseen": 2, "figures": False, "threads": 1, "device": NAME, "log_dir": tmp_path}
+        steps = dataclasses.replace(SMALL, **STEPS | (twinning or {}))
         with pretend_device():
-            module.main(module.Config(**small | options))
+            module.main(module.Config(**small | options, twinning=steps))
         return json.loads((tmp_path / "metrics.json").read_text())["episodes"]
 
     return run
 
 
 @pytest.mark.slow
-def test_real_system_and_td3(train):
-    (episode,) = train("pendulum", horizon=0.5, twinning={"learner": TD3})
-    assert episode["critic_gradient"] > 0.0
-
-
-@pytest.mark.slow
-def test_unknown_system(train):
-    """The physics that the twin believes are not those of the real system, and must be moved too."""
-    (episode,) = train("wind_turbine", horizon=4.0, unknown=("pitch",), policy="scheduled")
-    assert episode["real_cost"] > 0.0
-
-
-@pytest.mark.slow
-def test_figures_perceptrons_and_distillation(train):
-    episodes = train("wind_turbine", horizon=4.0, figures=True, episodes=2, **NEURAL)
-    assert "clone" in [episode["event"] for episode in episodes]
-
-
-@pytest.mark.slow
-def test_estimated_initial_states(train):
-    (episode,) = train("flapping_wing", horizon=0.005, figures=True, twinning={"assimilation": ESTIMATED})
-    assert episode["J_p"] < episode["J_p_before"]
+@pytest.mark.parametrize(
+    ("recipe", "options"),
+    [
+        ("pendulum", {"horizon": 0.5, "twinning": {"learner": TD3}}),
+        # The physics that the twin believes are not those of the real system, and must be moved too.
+        ("wind_turbine", {"horizon": 4.0, "unknown": ("pitch",), "policy": "scheduled"}),
+        ("wind_turbine", {"horizon": 4.0, "figures": True, "episodes": 2, **NEURAL}),
+        ("flapping_wing", {"horizon": 0.005, "figures": True, "twinning": {"assimilation": ESTIMATED}}),
+    ],
+)
+def test_a_training(train, recipe, options):
+    last = train(recipe, **options)[-1]
+    assert last["real_cost"] > 0.0 and last["critic_gradient"] > 0.0 and last["J_p"] <= last["J_p_before"]
+    assert (last["event"] == "clone") == ("episodes" in options)
 
 
 @pytest.mark.slow
@@ -266,9 +254,8 @@ def test_files_are_read_without_the_device(tmp_path):
 def test_modules_hold_no_tensor_that_stays_behind(recipe, kind):
     """``module.to(device)`` moves parameters and buffers alone."""
     own = "plant" if recipe == "pendulum" else "paper"
-    config = load_recipe(RECIPES / f"{recipe}.py").Config(
-        policy="mlp" if kind == "mlp" else own, closure=kind if kind == "mlp" and recipe != "pendulum" else own
-    )
+    policy, closure = (kind if kind == "mlp" else own), (kind if kind == "mlp" and recipe != "pendulum" else own)
+    config = load_recipe(RECIPES / f"{recipe}.py").Config(policy=policy, closure=closure)
     plant, generator = config.plant(), torch.Generator()
     made = [plant, config.make_closure(plant, generator), *config.make_policies(plant, generator).values()]
     left = [
