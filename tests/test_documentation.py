@@ -66,9 +66,7 @@ def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
     assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
     assert shown.count(" | ") == 7 * 3  # seven reasons
     scope_of("gallery.md")
-    assert {"states.png", "learning.png", "power_and_speed.png", "flights.png"} <= {
-        path.name for path in Path().iterdir()
-    }
+    assert len(list(Path().glob("*.png"))) == 4
 
 
 def test_the_extension_of_the_documentation_finds_a_leak():
