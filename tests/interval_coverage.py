@@ -8,17 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl import (
-    DigitalTwin,
-    Estimation,
-    EstimationConfig,
-    Plant,
-    Rollout,
-    Sensor,
-    SensorRecord,
-    Trajectory,
-    sensor_record,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -33,9 +23,9 @@ from rt_torchrl.fit.resampling import filled, initial_spread, logged_readings, r
 from rt_torchrl.fit.uncertainty import named_values
 from rt_torchrl.plants.signal import bounds
 
-Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
+Flights = Callable[[rt.Plant, nn.Module, torch.Generator], list[rt.Trajectory]]
 """Flies the episodes whose records are one simulation, of a plant with a closure."""
-Simulated = tuple[list[SensorRecord], Tensor | None]
+Simulated = tuple[list[rt.SensorRecord], Tensor | None]
 """Records of one simulation, and the spread of their first states; None if nothing is known of these."""
 HELD = 20
 """Number of control intervals for which a random command is held."""
@@ -68,13 +58,13 @@ def values_of(closure: nn.Module) -> Tensor:
 
 
 def coverage(
-    plant: Plant,
+    plant: rt.Plant,
     closure: nn.Module,
-    sensors: Sequence[Sensor],
+    sensors: Sequence[rt.Sensor],
     simulated: Callable[[], Simulated],
     *,
     simulations: int,
-    config: EstimationConfig | None = None,
+    config: rt.EstimationConfig | None = None,
 ) -> Coverage:
     """Estimate from simulated records with noise, and compare with the closure of the simulated system.
 
@@ -88,11 +78,11 @@ def coverage(
         simulations: number of simulations.
         config: parameters of the estimation.
     """
-    twin, errors, scatter = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True)), [], []
+    twin, errors, scatter = rt.DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True)), [], []
     for _ in range(simulations):
         records, spread = simulated()
         twin.closure.load_state_dict(closure.state_dict())
-        found = Estimation(twin, sensors, spread=spread, config=config).run(records)
+        found = rt.Estimation(twin, sensors, spread=spread, config=config).run(records)
         errors.append(values_of(twin.closure) - values_of(closure))
         scatter.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
     z, bound = torch.stack(errors) / torch.stack(scatter), torch.stack(scatter)
@@ -105,9 +95,9 @@ def coverage(
 
 
 def recorded(
-    plant: Plant,
+    plant: rt.Plant,
     closure: nn.Module,
-    sensors: Sequence[Sensor],
+    sensors: Sequence[rt.Sensor],
     generator: torch.Generator,
     *,
     share: float = 0.01,
@@ -118,7 +108,7 @@ def recorded(
     ``share`` is the standard deviation of the noise over the RMS deviation of a sensor's readings from their mean.
     """
     flown = (flights or random_flights)(plant, closure, generator)
-    return with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator), None
+    return with_noise([rt.sensor_record(plant, sensors, one) for one in flown], share, generator), None
 
 
 class Logging(NamedTuple):
@@ -136,11 +126,11 @@ class Logging(NamedTuple):
 
 
 def logged(
-    plant: Plant, closure: nn.Module, sensors: Sequence[Sensor], generator: torch.Generator, logging: Logging
+    plant: rt.Plant, closure: nn.Module, sensors: Sequence[rt.Sensor], generator: torch.Generator, logging: Logging
 ) -> Simulated:
     """The records that ``identify.py`` makes of the log of an episode, and the spread of their first states."""
     flown = random_flight(plant, closure, generator)
-    (record,) = with_noise([sensor_record(plant, sensors, flown)], 0.01, generator)
+    (record,) = with_noise([rt.sensor_record(plant, sensors, flown)], 0.01, generator)
     rows = slice(0, None, logging.every)
     held = [torch.cat([values, values[-1:]])[rows] for values in (flown.actions, flown.exogenous)]
     readings = record.readings[rows].clone()
@@ -158,7 +148,7 @@ def logged(
     return records, initial_spread(plant, log)
 
 
-def with_noise(records: Sequence[SensorRecord], share: float, generator: torch.Generator) -> list[SensorRecord]:
+def with_noise(records: Sequence[rt.SensorRecord], share: float, generator: torch.Generator) -> list[rt.SensorRecord]:
     """Records with white noise, whose guesses of the first states stay the true ones; see :func:`recorded`."""
     readings = torch.cat([record.readings for record in records])
     scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
@@ -171,8 +161,8 @@ def with_noise(records: Sequence[SensorRecord], share: float, generator: torch.G
 
 @torch.no_grad()
 def random_flight(
-    plant: Plant, closure: nn.Module, generator: torch.Generator, *, low: float = 0.3, high: float = 0.7
-) -> Trajectory:
+    plant: rt.Plant, closure: nn.Module, generator: torch.Generator, *, low: float = 0.3, high: float = 0.7
+) -> rt.Trajectory:
     """One episode of the plant under random commands, each held for some intervals.
 
     Args:
@@ -185,10 +175,10 @@ def random_flight(
     least, greatest = bounds(plant.actions)
     drawn = torch.rand(1, -(-plant.n_steps // HELD), len(least), generator=generator, dtype=torch.float64)
     share = low + (high - low) * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
-    return Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]
+    return rt.Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]
 
 
-def random_flights(plant: Plant, closure: nn.Module, generator: torch.Generator) -> list[Trajectory]:
+def random_flights(plant: rt.Plant, closure: nn.Module, generator: torch.Generator) -> list[rt.Trajectory]:
     """One episode under random commands."""
     return [random_flight(plant, closure, generator)]
 
@@ -196,14 +186,14 @@ def random_flights(plant: Plant, closure: nn.Module, generator: torch.Generator)
 class Case(NamedTuple):
     """What is simulated: plant, closure of the real system, sensors, and episodes of one simulation."""
 
-    plant: Callable[[], Plant]
+    plant: Callable[[], rt.Plant]
     closure: Callable[[Any], nn.Module]
     sensors: tuple[str, ...]
     flights: Flights | None = None
 
 
 @torch.no_grad()
-def turbine_flights(plant: Plant, closure: nn.Module, generator: torch.Generator) -> list[Trajectory]:
+def turbine_flights(plant: rt.Plant, closure: nn.Module, generator: torch.Generator) -> list[rt.Trajectory]:
     """An episode of the classical controller, and two under random commands in their whole ranges.
 
     In the middle of the ranges the blades are never flat, and nothing tells the weights of what they do there.

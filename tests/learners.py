@@ -27,15 +27,7 @@ from ruler import kept
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
-from rt_torchrl import (
-    ActorCritic,
-    DigitalTwin,
-    ExplorationConfig,
-    LearnerConfig,
-    PlantEnv,
-    ReinforcementTwinning,
-    TwinningConfig,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -44,19 +36,19 @@ from rt_torchrl.plants.policies import SaturatedMLP
 
 ALGORITHMS = ("ddpg", "td3", "sac")
 EPISODES = 20
-RATES = {"actor_rate": ActorCritic.critic_rate, "target_rate": 0.02}
+RATES = {"actor_rate": rt.ActorCritic.critic_rate, "target_rate": 0.02}
 SYSTEMS = {
     "pendulum": (
         Pendulum(),
         gymnasium_pendulum,
-        ExplorationConfig(spread=0.1, episodes=10**9),
-        LearnerConfig(critic_iterations=200, actor_iterations=200, reward_scale=0.1, **RATES),
+        rt.ExplorationConfig(spread=0.1, episodes=10**9),
+        rt.LearnerConfig(critic_iterations=200, actor_iterations=200, reward_scale=0.1, **RATES),
     ),
     "turbine": (
         WindTurbine(horizon=200.0, observe=("measured+wind",)),
-        PlantEnv,
-        ExplorationConfig(spread=0.2, episodes=10**9),
-        LearnerConfig(critic_iterations=100, actor_iterations=100, return_steps=10, **RATES),
+        rt.PlantEnv,
+        rt.ExplorationConfig(spread=0.2, episodes=10**9),
+        rt.LearnerConfig(critic_iterations=100, actor_iterations=100, return_steps=10, **RATES),
     ),
 }
 """Plant, real system, noise, which does not fade, and what both learners are given."""
@@ -65,14 +57,14 @@ SYSTEMS = {
 def of_this_library(plant, real, exploration, learner, seed):
     """A policy of the arm ``model_free``."""
     generator = torch.Generator().manual_seed(seed)
-    widths = {"hidden": ActorCritic.critic_hidden, "generator": generator}
+    widths = {"hidden": rt.ActorCritic.critic_hidden, "generator": generator}
     policies = [SaturatedMLP(len(plant.observations), plant.actions, **widths) for _ in range(2)]
-    training = ReinforcementTwinning(
+    training = rt.ReinforcementTwinning(
         real(plant, seed=seed),
-        DigitalTwin(plant, plant.make_closure(generator)),
+        rt.DigitalTwin(plant, plant.make_closure(generator)),
         model_free=policies[0],
         model_based=policies[1],
-        config=TwinningConfig(arm="model_free", exploration=exploration, learner=learner),
+        config=rt.TwinningConfig(arm="model_free", exploration=exploration, learner=learner),
         generator=generator,
     )
     for _ in range(EPISODES):
@@ -87,7 +79,7 @@ def of_stable_baselines3(plant, real, exploration, learner, seed):
     agent = getattr(stable_baselines3, learner.algorithm.upper())(
         "MlpPolicy",
         gymnasium.wrappers.TransformReward(env, lambda reward: learner.reward_scale * reward),
-        learning_rate=ActorCritic.critic_rate,
+        learning_rate=rt.ActorCritic.critic_rate,
         learning_starts=0,
         batch_size=learner.batch_size,
         tau=learner.target_rate,
@@ -95,7 +87,7 @@ def of_stable_baselines3(plant, real, exploration, learner, seed):
         train_freq=(1, "episode"),
         gradient_steps=learner.critic_iterations,
         n_steps=learner.return_steps,
-        policy_kwargs={"net_arch": list(ActorCritic.critic_hidden), "activation_fn": nn.SiLU},
+        policy_kwargs={"net_arch": list(rt.ActorCritic.critic_hidden), "activation_fn": nn.SiLU},
         seed=seed,
         device="cpu",
         **({} if learner.algorithm == "sac" else noise),
@@ -110,7 +102,7 @@ IMPLEMENTATIONS = {"rt_torchrl": of_this_library, "stable-baselines3": of_stable
 @torch.no_grad()
 def mean_return(plant, policy):
     """Mean sum of the rewards in 20 unseen episodes; the pendulum of this library steps as Gymnasium's does."""
-    env = PlantEnv(plant, seed=UNSEEN_SEED)
+    env = rt.PlantEnv(plant, seed=UNSEEN_SEED)
     act = lambda td: td.set("action", policy(td["observation"]))  # noqa: E731
     return sum(env.rollout(plant.n_steps, act)["next", "reward"].sum().item() for _ in range(20)) / 20
 
