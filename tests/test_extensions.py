@@ -244,21 +244,14 @@ def test_whatever_a_plant_overrides_holds_under_every_extension(kind):
     assert asked == (answers.keys() | {"make_closure", "make_neural_closure", "make_policy"}) - {"discrepancy"}
 
 
-def test_a_plant_says_which_methods_it_must_define():
-    class Half(rt.Plant):
-        name, states, actions, inputs, observations = "half", (), (), (), ()
-
-        def vector_field(self, t, state, action, exogenous, closure):
-            return state
-
+def test_what_a_plant_and_an_extension_must_have_and_take():
+    signals = dict.fromkeys(("states", "actions", "inputs", "observations"), ())
+    parts = {"name": "half", "vector_field": LinearQuadratic.vector_field, **signals}
     with pytest.raises(TypeError, match="Half must define running_cost, draw_initial_state, draw_exogenous, make_cl"):
-        Half(dt=0.1, horizon=1.0, closure=nn.Identity())
-
-
-def test_hidden_states_need_a_start():
-    class Startless(rt.Extension):
-        pass
-
+        type("Half", (rt.Plant,), parts)(dt=0.1, horizon=1.0, closure=nn.Identity())
+    with pytest.raises(TypeError, match="make_policy of LaggedActuator takes generator"):
+        EXTENSIONS["lag"](LinearQuadratic()).make_policy(seeded(), bias=True)  # an argument of the plant alone
+    Startless = type("Startless", (rt.Extension,), {})
     with pytest.raises(TypeError, match=r"Startless has hidden states.*rest\(\)"):
         Startless(LinearQuadratic(), [rt.Signal(symbol="x", name="hidden", unit="-")])
     assert Startless(LinearQuadratic(), []).at_rest(torch.ones(1, 2).double()).tolist() == [[1.0, 1.0]]
