@@ -226,12 +226,12 @@ def test_no_correction_says_that_a_policy_is_cheaper_than_any_flight_was(monkeyp
 class Told:
     """Replays whose corrections are known of each policy, a multiple of ten of which says how far it is from others."""
 
-    def __init__(self, corrections, explored=(0.0, 0.0, 0.0)):
-        self.told = corrections
-        self.offsets, self.explored = torch.zeros(3).double(), torch.tensor(explored).double()
+    def __init__(self, corrections, explored, apart):
+        self.told, self.apart = corrections, apart
+        self.offsets, self.explored = torch.zeros(3).double(), torch.tensor([explored] * 3).double()
 
     def distances(self):
-        places = torch.tensor([0.0, 0.1, 0.2]).double()
+        places = self.apart * torch.arange(3).double()
         return (places.unsqueeze(-1) - places).square()
 
     def corrections(self, policy):
@@ -242,22 +242,23 @@ class Told:
 
 
 @pytest.mark.parametrize(
-    ("scatter", "apart", "explored"),
-    [(0.0, 0.0, 0.0), (0.0, 0.3, 0.0), (0.4, 0.0, 0.0), (0.4, 1.0, 0.0), (0.4, 0.3, 0.04)],
+    ("scatter", "slope", "explored", "apart"),
+    # Scatter between like policies is noise, and that between others grows with their distance.
+    [(0.0, 0.0, 0.0, 0.1), (0.0, 0.3, 0.0, 0.1), (0.4, 0.0, 0.0, 0.01), (0.4, 1.0, 0.0, 0.1), (0.4, 0.3, 0.04, 0.1)],
 )
-def test_noise_and_growth_are_the_most_likely_ones(scatter, apart, explored):
+def test_noise_and_growth_are_the_most_likely_ones(scatter, slope, explored, apart):
     """Three episodes predict each other's corrections of 1 with errors; the optimum is found on a grid."""
     belief = belief_of([(0.1 * k, 0.0) for k in range(3)], LinearQuadratic(horizon=2.0))
     signs = [[0.0, 1.0, -1.0], [-1.0, 0.0, 1.0], [1.0, -1.0, 0.0]]
-    corrections = [[1.0 + apart * (k - j) + scatter * signs[j][k] for k in range(3)] for j in range(3)]
-    found = belief._variances(Told(corrections, [explored] * 3), belief.flown, [1.0] * 3)
+    corrections = [[1.0 + slope * (k - j) + scatter * signs[j][k] for k in range(3)] for j in range(3)]
+    found = belief._variances(Told(corrections, explored, apart), belief.flown, [1.0] * 3)
     noise = np.exp(np.linspace(math.log(NOISE**2), math.log(NOISE**2) + 6.0, 401))
     growth = np.exp(np.linspace(math.log(10.0) - 5.0, math.log(10.0) + 5.0, 401))
     sigma, v = np.meshgrid(noise, growth, indexing="ij")
     chances = 2.0 * (np.log(sigma) + NOISE**2 / sigma + np.log(v) + 10.0 / v)
     for j in range(3):
         for k in {0, 1, 2} - {j}:
-            variance = 2.0 * sigma + v * ((0.1 * (j - k)) ** 2 + 2.0 * explored)
+            variance = 2.0 * sigma + v * ((apart * (j - k)) ** 2 + 2.0 * explored)
             chances += 0.5 * (np.log(variance) + (corrections[j][j] - corrections[j][k]) ** 2 / variance)
     best = np.unravel_index(chances.argmin(), chances.shape)
     assert found == (pytest.approx(noise[best[0]], rel=0.03), pytest.approx(growth[best[1]], rel=0.05))
