@@ -115,7 +115,7 @@ def test_hh_known_numbers_gust_ninth_column_commas_and_blank_lines(tmp_path):
         (lambda lines: [*lines[:3], *lines[5:]], r"wind\.hh: the step after t = 1 s is 1.5 s"),
         (lambda lines: [lines[0].replace("8.00", " NaN"), *lines[1:]], r"line 4: value 'NaN' or .* is not finite"),
         (lambda lines: [*lines[:4], "********" + lines[4][8:]], r"wind\.hh, line 8: could not convert"),
-        (lambda lines: [*lines[:9], lines[9][:20]], r"wind\.hh, line 13: 3 columns, but 8 are needed"),
+        (lambda lines: [*lines[:9], lines[9][:24]], r"wind\.hh, line 13: 3 columns, but 8 are needed"),
         (lambda lines: [], r"wind\.hh: holds 0 wind samples"),
     ],
 )
