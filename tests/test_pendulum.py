@@ -58,8 +58,7 @@ def test_a_step_is_gymnasiums(mass, length):
     assert wrapped(end[:, 0] - theirs[:, 0]).abs().max() < 1e-13
     torch.testing.assert_close(-plant.running_cost(t, states, applied, nothing), rewards, rtol=1e-13, atol=1e-13)
     # The stops of torque and speed have been met, and not everywhere.
-    for stopped in (applied.abs() == 2.0, end[:, 1].abs() == 8.0):
-        assert 5 < stopped.sum() < 495
+    assert all(5 < stopped.sum() < 495 for stopped in (applied.abs() == 2.0, end[:, 1].abs() == 8.0))
 
 
 def test_the_real_system_reports_gymnasiums_reward_and_starts():
@@ -68,10 +67,9 @@ def test_the_real_system_reports_gymnasiums_reward_and_starts():
     episode = system.rollout(200)
     assert episode.shape == (1, 200) and episode["next", "truncated"][0, -1]
     states, actions = episode["state"][0], episode["action"][0]
-    _, rewards = gymnasium_steps(states, actions)
+    following, rewards = gymnasium_steps(states, actions)
     # Gymnasium reports cosine, sine and speed in single precision: 6e-8 of numbers up to 8, in costs up to 16.
     torch.testing.assert_close(episode["next", "reward"][0, :, 0], rewards, rtol=1e-6, atol=1e-6)
-    following, _ = gymnasium_steps(states, actions)
     assert wrapped(following[:, 0] - episode["next", "state"][0, :, 0]).abs().max() < 5e-6
     torch.testing.assert_close(following[:, 1], episode["next", "state"][0, :, 1], rtol=0, atol=5e-6)
     assert states[0, 1].abs() <= 1.0

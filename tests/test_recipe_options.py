@@ -14,7 +14,7 @@ from pydantic import Field
 from test_export_recipe import RECIPES, recipe
 
 from rt_torchrl import DescentConfig, Plant, RunConfig, rk4_step
-from rt_torchrl.options import File, Limit, Widths, configuration, read_options
+from rt_torchrl.options import Widths, configuration, read_options
 from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
 
@@ -25,17 +25,8 @@ def test_weights_of_another_task_are_refused():
     assert made.Config(task="engineering", engineering=weights).plant().cost == weights
     with pytest.raises(ValueError, match="weights of the task engineering"):
         made.Config(engineering=weights)
-
-
-@pytest.mark.parametrize("plant", ["pendulum", "wind_turbine"])
-def test_a_device_that_is_not_there_is_refused_before_the_real_system_is_made(plant, tmp_path):
-    """Gymnasium's pendulum is made before the run; so is ROSCO's turbine, where its toolbox is installed."""
-    pytest.importorskip("gymnasium" if plant == "pendulum" else "rosco")
-    module = recipe(plant)
-    real = {} if plant == "pendulum" else {"real": "rosco", "policy": "scheduled"}
     with pytest.raises(ValueError, match="device='nowhere' cannot be used on this machine .* use cpu"):
-        module.main(module.Config(device="nowhere", log_dir=tmp_path / "run", **real))
-    assert not (tmp_path / "run").exists()
+        made.main(made.Config(device="nowhere"))
 
 
 def of_command_line(plant, *words):
@@ -84,40 +75,13 @@ def test_presets_of_a_neural_closure_and_of_predictive_control(plant):
     assert dataclasses.replace(mpc, preset="default", twinning=usual.twinning) == usual
 
 
-def test_a_plant_without_a_paper_has_no_words_of_it():
-    pendulum = config_class_of(RECIPES / "pendulum.py")
-    assert from_command_line(pendulum, ["--policy", "plant", "--closure", "plant"]) == from_command_line(pendulum, [])
-
-
-@pytest.mark.parametrize(
-    ("words", "spread", "rate"),
-    [
-        ([], 0.02, 0.01),
-        (["--start", "random"], 0.2, 0.01),
-        (["--preset", "paper"], 0.2, 0.02),
-        (["--starts", "random", "--episodes", "0"], 0.02, 0.01),  # what cannot be carried out
-    ],
-)
-def test_the_help_shows_the_defaults_that_hold(words, spread, rate, capsys):
-    config = config_class_of(RECIPES / "wind_turbine.py")
-    with pytest.raises(SystemExit) as ended:
-        from_command_line(config, [*words, "--help-all"])
-    printed = capsys.readouterr()
-    assert ended.value.code == 0 and not printed.err
-    said = " ".join(printed.out.replace("│", " ").split())
-    for option, value in (("exploration.spread FLOAT", spread), ("learner.target-rate FLOAT", rate)):
-        described = said.split(f"--twinning.{option}")[1].split(" --")[0]
-        assert f"(default: {value})" in described
-
-
 @pytest.mark.parametrize("plant", [*PLANTS, "pendulum", "served_turbine"])
 def test_the_help_has_a_screenful_of_options_and_help_all_has_the_rest(plant, capsys):
     config = config_class_of(RECIPES / f"{plant}.py")
     listed = []
     for word in ("--help", "--help-all"):
-        with pytest.raises(SystemExit) as ended:
-            from_command_line(config, [word])
-        assert ended.value.code == 0
+        with pytest.raises(SystemExit, match="0"):
+            from_command_line(config, ["--episodes", "0", word])  # beside what cannot be carried out, too
         listed.append(re.findall(r"(?m)^[│ ]*--([a-z][a-z.-]*)", capsys.readouterr().out))
     short, full = (set(names) - {"help-all"} for names in listed)
     parts = {field.name for field in dataclasses.fields(config) if dataclasses.is_dataclass(field.type)}
@@ -130,18 +94,13 @@ def test_the_help_has_a_screenful_of_options_and_help_all_has_the_rest(plant, ca
 
 @configuration
 class Example:
-    law: Literal["affine", "cubic", "mlp"] = "affine"
     other: Literal["affine", "cubic"] | None = None
-    laws: tuple[Literal["affine", "cubic"], ...] = ()
     count: Annotated[int, Field(ge=1)] = 1
-    most: int | None = None
     rate: Annotated[float, Field(gt=0, lt=2)] = 0.1
-    deadline: Limit = math.inf
     limits: tuple[float, float] | None = None
     widths: Widths = (8, 8)
     free: str = "anything"
     flag: bool = False
-    file: File | None = None
     inner: DescentConfig = dataclasses.field(default_factory=DescentConfig)
 
     def __post_init__(self):
@@ -150,12 +109,10 @@ class Example:
 
 
 REFUSED = [
-    ({"law": "quartic"}, "law='quartic' does not exist; choose affine, cubic or mlp."),
     ({"other": "mlp"}, "other='mlp' does not exist; choose affine or cubic."),
     ({"count": 0}, "count=0 must be at least 1."),
     ({"count": 2.5}, "count=2.5 must be a whole number."),
     ({"rate": math.nan}, "rate=nan must be"),
-    ({"rate": 2.0}, "rate=2.0 must be less than 2."),
     ({"rate": "fast"}, "rate='fast' must be a number."),
     ({"limits": (1.0, 2.0, 3.0)}, "limits=(1.0, 2.0, 3.0) must have at most 2 entries."),
     ({"widths": (8, 0)}, "widths[1]=0 must be at least 1."),
@@ -163,10 +120,7 @@ REFUSED = [
     ({"inner": None}, "inner=None must be a DescentConfig."),
     ({"free": "nothing", "flag": True}, "free='nothing' does not go with flag."),
     ({"speed": 1}, "Example has no option speed"),
-    (
-        {"count": 0, "flag": "yes"},
-        "count=0 must be at least 1. flag='yes' must be True or False.",
-    ),
+    ({"count": 0, "flag": "yes"}, "count=0 must be at least 1. flag='yes' must be True or False."),
 ]
 
 
@@ -197,9 +151,7 @@ def test_a_class_that_checks_none_of_its_options_is_refused():
     class Unchecked(RunConfig):
         law: Literal["affine", "cubic"] = "affine"
 
-    with pytest.raises(
-        ValueError, match="the options of Unchecked are not checked; decorate it by @rt_torchrl.configuration"
-    ):
+    with pytest.raises(ValueError, match="the options of Unchecked are not checked; decorate it by @rt_torchrl.conf"):
         Unchecked()
 
 
@@ -224,37 +176,23 @@ def without_a_package(config):
         raise RuntimeError("as Gymnasium says it") from error
 
 
-@pytest.mark.parametrize(
-    ("main", "message"),
-    [
-        (lambda config: importlib.import_module("not_installed.part"), "the package not_installed is not installed"),
-        (without_a_package, "the package not_installed is not installed; .* --extra EXTRA"),
-        (lambda config: Path("gone.bts").read_text(), "No such file or directory: 'gone.bts'"),
-        (lambda config: dataclasses.replace(config, seed=-1), "seed=-1 must be"),
-    ],
-)
-def test_what_the_user_can_mend_is_told_in_a_line(main, message):
-    with pytest.raises(SystemExit, match=f"error: .*{message}"):
-        main_of(Config, main)
+def pressed(config):
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
-    ("main", "kind"),
+    ("main", "kind", "message"),
     [
-        (lambda config: torch.ones(2).view(3, 3), RuntimeError),
-        (lambda config: rk4_step(None, None, None), TypeError),
-        (lambda config: Plant.vector_field(None, None, None, None, None, None), NotImplementedError),
+        (lambda config: importlib.import_module("not_installed.part"), SystemExit, "error: the package not_installed"),
+        (without_a_package, SystemExit, "error: the package not_installed is not installed; .* --extra EXTRA"),
+        (lambda config: Path("gone.bts").read_text(), SystemExit, "error: .*No such file or directory: 'gone.bts'"),
+        (lambda config: dataclasses.replace(config, seed=-1), SystemExit, "error: seed=-1 must be"),
+        (pressed, SystemExit, "130"),
+        (lambda config: torch.ones(2).view(3, 3), RuntimeError, "."),
+        (lambda config: rk4_step(None, None, None), TypeError, "."),
+        (lambda config: Plant.vector_field(None, None, None, None, None, None), NotImplementedError, "^$"),
     ],
 )
-def test_another_error_keeps_its_traceback(main, kind):
-    with pytest.raises(kind):
+def test_what_the_user_can_mend_is_told_in_a_line_and_another_error_keeps_its_traceback(main, kind, message):
+    with pytest.raises(kind, match=message):
         main_of(Config, main)
-
-
-def test_an_interrupt_leaves_as_shells_report_it():
-    def main(config):
-        raise KeyboardInterrupt
-
-    with pytest.raises(SystemExit) as left:
-        main_of(Config, main)
-    assert left.value.code == 130

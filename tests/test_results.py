@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import math
-import re
-import sys
 from unittest.mock import Mock
 
 import pytest
@@ -26,10 +24,8 @@ from rt_torchrl.runs.results import (
     alarm_lines,
     closure_lines,
     cost_of_learning,
-    dearer_than_first,
     fit_lines,
     next_steps,
-    results_table,
 )
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
@@ -79,7 +75,6 @@ ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
 @pytest.mark.parametrize(
     ("known", "errors", "columns", "rows"),
     [
-        ({}, None, "", ["a 1 1.5", "b 2 2.5"]),
         ({"true": {"other": 1.0}}, None, "", ["a 1 1.5", "b 2 2.5"]),
         ({"true": {"a": 1.25}}, {"a": 0.25, "b": None}, " std. error true", ["a 1 1.5 0.25 1.25", "b 2 2.5 - -"]),
         ({}, {"a": 0.0, "b": 0.5}, " std. error", ["a 1 1.5 fixed", "b 2 2.5 0.5"]),
@@ -103,43 +98,22 @@ def test_it_names_each_step_as_it_begins():
     assert told == STEPS and set(dashboard.WORDS) == {"start", *STEPS}
 
 
-def test_it_shows_the_step_and_the_costs_of_the_last_episode(monkeypatch, capsys):
-    with monkeypatch.context() as terminal:
-        terminal.setattr(sys.stderr, "isatty", lambda: True)
-        with Progress(3) as bar:
-            bar.doing("assimilate")
-            bar.episode({"episode": 1, "real_cost": 0.25, "live": "model_free"})
-            bar.doing("drawing figures")
-    shown = capsys.readouterr().err
-    assert "assimilating" in shown and "1/3" in shown and "real 0.25, live model-free; drawing figures" in shown
-
-
-def test_it_says_why_no_policy_may_act(capsys):
-    with Progress(2) as bar:
-        bar.episode({"episode": 1, "real_cost": 0.25, "live": "first", "reason": "model_based may not act: it is dear"})
-    assert "episode 1: model_based may not act: it is dear" in capsys.readouterr().out
-
-
-def test_a_log_has_a_line_for_each_episode_and_for_what_begins_after_a_while(monkeypatch, capsys):
+def test_a_log_has_a_line_for_each_episode_and_for_what_changes_or_begins_after_a_while(monkeypatch, capsys):
+    dear = {"live": "first", "reason": "model_based may not act: it is dear"}
     with Progress(3) as bar:
         bar.doing("checking the gradient")
         bar.doing("assimilate")
-        bar.episode({"episode": 1, "real_cost": 0.25, "live": "model_free"})
+        for episode, found in enumerate(({"believed": "pitch lag"}, {"believed": "pitch lag"}, dear), 1):
+            bar.episode({"episode": episode, "real_cost": 0.25, "live": "model_free"} | found)
         monkeypatch.setattr(dashboard, "QUIET", 0.0)
         bar.doing("plan")
-    expected = ["checking the gradient", "episode 1/3: real 0.25, live model-free", "planning"]
-    assert capsys.readouterr().err.splitlines() == expected
-
-
-def test_it_says_when_another_twin_is_believed(capsys):
-    record = {"real_cost": 0.25, "live": "model_free", "J_p": 1.0}
-    with Progress(4) as bar:
-        for episode, believed in enumerate((None, "pitch lag, late by 3", "pitch lag, late by 3", None), 1):
-            bar.episode(record | {"episode": episode, "believed": believed})
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "is the likeliest" in line]
-    assert lines == [
-        "episode 2: the twin with 'pitch lag, late by 3' is the likeliest; J_p and closure are its own",
-        "episode 4: the twin alone is the likeliest; J_p and closure are its own",
+    shown, likeliest = capsys.readouterr(), "is the likeliest; J_p and closure are its own"
+    costs = [f"episode {k}/3: real 0.25, live {'first' if k == 3 else 'model-free'}" for k in (1, 2, 3)]
+    assert shown.err.splitlines() == ["checking the gradient", *costs, "planning"]
+    assert [line for line in map(str.strip, shown.out.splitlines()) if line] == [
+        f"episode 1: the twin with 'pitch lag' {likeliest}",
+        "episode 3: model_based may not act: it is dear",
+        f"episode 3: the twin alone {likeliest}",
     ]
 
 
@@ -194,25 +168,6 @@ def test_a_file_may_hold_a_few_options(tmp_path):
     assert found.twinning.planner.realisations == default.twinning.planner.realisations == 50
 
 
-def many_weights(metrics, count):
-    """Results as those of a plant with a classical controller, five merits and a closure of many weights."""
-    merit = {f"quantity {k}": {"mean": 1.0, "median": 1.0} for k in range(5)}
-    cost = {"mean": 2.0, "confidence_interval": [1.0, 3.0]}
-    unseen = metrics["summary"]["unseen"] | {"merit": dict.fromkeys(("model_based", "model_free"), merit)}
-    unseen |= {"baselines": {"PI": {"J_a": cost, "merit": merit, "ratio": cost, "cheaper": 0}}}
-    start = {f"c{k}": 1.0 for k in range(count)}
-    found = start | {"c3": 2.0, "c5": 1.5, "c7": None}
-    closure = {"start": start, "found": found, "true": {}, "described": {}}
-    return metrics | {"summary": metrics["summary"] | {"unseen": unseen, "closure": closure}}
-
-
-@pytest.mark.parametrize(("count", "rows"), [(12, 12), (40, 0)])
-def test_the_summary_shows_the_weights_of_a_small_closure(stopped, count, rows):
-    shown = results_table(many_weights(stopped[1], count))
-    assert len(re.findall(r"(?m)^  c\d+ ", shown)) == rows
-    assert ("closure: 40 weights, in metrics.json" in shown) == (rows == 0)
-
-
 def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     metrics = stopped[1]
     live = metrics["summary"]["live"]
@@ -224,33 +179,25 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
         return next_steps({"summary": found}, tmp_path, config)
 
-    other = {"model_based": "model_free", "model_free": "model_based"}[live]
-    assert "recipes/export.py" in said(live, 2.0 * cost)
+    other, first = {"model_based": "model_free", "model_free": "model_based"}[live], {"expected": 3.0, "paid": 2.0}
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
-    first = {"expected": 3.0, "paid": 2.0}
     told = said(live, 2.0 * cost, place="twin", first=first)
     assert "the controller that flew first is better than the live policy" in told
     assert "recipes/export.py" in said(live, 2.0 * cost, place="twin", first={"expected": 2.0, "paid": 3.0})
     assert "recipes/export.py" in said(live, 2.0 * cost, first=first)  # other episodes tell more
-    assert dearer_than_first({"first": first | {"expected": None}}).startswith(
-        "the live policy is expected to cost - on"
-    )
     assert said("model_free", math.inf, live="model_free").endswith("--role model_free")
     planned = said("model_based", math.inf, "receding_horizon", live="model_based")
     assert planned.endswith("--what twin")
 
 
 def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
-    rms = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None, "height [m]": 2.0}
-    found = {"rms": rms, "segment": 0, "standard_errors": {}}
-    line = "RMS rotor_speed 0.0123 rad/s, shares diverges, height 2 m"
-    assert fit_lines(found) == [f"  twin over its last records: {line}"]
-    assert fit_lines(found | {"segment": 22}) == [f"  twin over segments of 22 intervals: {line}"]
-    assert fit_lines({"rms": {}, "segment": 0, "standard_errors": {}}) == []
-    record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"}
-    record |= {f"rms/{name}": value for name, value in rms.items()}
-    assert progress_line(record) == "RMS rotor_speed 0.0123 rad/s, shares diverges, real 0.5, live model-free"
+    rms, line = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None}, "RMS rotor_speed 0.0123 rad/s, shares diverges"
+    for segment, where in ((0, "its last records"), (22, "segments of 22 intervals")):
+        found = {"rms": rms, "segment": segment, "standard_errors": {}}
+        assert fit_lines(found) == [f"  twin over {where}: {line}"]
+    record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"} | {f"rms/{name}": rms[name] for name in rms}
+    assert progress_line(record) == f"{line}, real 0.5, live model-free"
 
 
 def test_every_window_is_paid_and_episodes_are_counted_from_one():
@@ -260,15 +207,14 @@ def test_every_window_is_paid_and_episodes_are_counted_from_one():
     assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]
 
 
-@pytest.mark.parametrize(("episodes", "summary"), [({}, {}), ([1], {}), ([], None), (None, {})])
-def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
+SHAPE = "it must be an object with episodes, a list of objects, and summary, an object"
+LIVE = "summary names the live policy 'pilot'; it must be model_based or model_free"
+
+
+@pytest.mark.parametrize(
+    ("episodes", "summary", "message"), [([1], {}, SHAPE), ([], None, SHAPE), ([], {"live": "pilot"}, LIVE)]
+)
+def test_results_of_another_shape_are_refused(tmp_path, episodes, summary, message):
     (tmp_path / "metrics.json").write_text(json.dumps({"episodes": episodes, "summary": summary}))
-    message = (
-        r"metrics\.json is damaged: it must be an object with episodes, a list of objects, and summary, an object\."
-    )
-    with pytest.raises(ValueError, match=message):
-        read_metrics(tmp_path)
-    (tmp_path / "metrics.json").write_text(json.dumps({"episodes": [], "summary": {"live": "pilot"}}))
-    message = r"metrics\.json is damaged: summary names the live policy 'pilot'; it must be model_based or model_free"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"metrics\.json is damaged: {message}"):
         read_metrics(tmp_path)

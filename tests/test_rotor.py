@@ -8,6 +8,7 @@ import pytest
 import torch
 from blade_element import power_coefficients, worn_values
 from scipy.interpolate import RectBivariateSpline
+from seeds_and_numbers import double
 
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 
@@ -23,10 +24,6 @@ def table() -> PowerCoefficientTable:
 def uneven() -> PowerCoefficientTable:
     values = 0.4 - 0.02 * (LAM[:, None] - 6.0) ** 2 - 0.003 * (BETA - 1.0) ** 2 + 0.01 * np.sin(3 * LAM[:, None] + BETA)
     return PowerCoefficientTable(LAM, BETA, values)
-
-
-def features(*points) -> torch.Tensor:
-    return torch.tensor(points, dtype=torch.float64)
 
 
 def grid(lam, beta) -> torch.Tensor:
@@ -63,9 +60,8 @@ def test_gradient_in_every_zone_and_across_edges(table):
     # Central differences over a step of 1e-6 straddle the edges; C¹ leaves an error of step times the jump of the
     # second derivative (largest at the last row), below 1e-5.
     for x in torch.cartesian_prod(lam, beta):
-        assert torch.autograd.gradcheck(
-            table, x.requires_grad_(), eps=1e-6, atol=1e-5, rtol=1e-5, check_forward_ad=True
-        )
+        x.requires_grad_()
+        assert torch.autograd.gradcheck(table, x, eps=1e-6, atol=1e-5, rtol=1e-5, check_forward_ad=True)
 
 
 def test_torque_vanishes_at_standstill(table):
@@ -75,7 +71,7 @@ def test_torque_vanishes_at_standstill(table):
     # C_p = kλ² there with k = 0.2 C_p(2, β) <= 0.016, so C_p/λ = kλ.
     assert (torque.abs() <= 0.02 * lam[:, None]).all()
     torch.testing.assert_close(torque[-1] * 1e8, torque[0] * 10, rtol=1e-12, atol=0)
-    assert (table(features((-0.5, 3.0), (0.0, 3.0), (-40.0, 20.0))) == 0).all()
+    assert (table(double((-0.5, 3.0), (0.0, 3.0), (-40.0, 20.0))) == 0).all()
 
 
 def test_stall_never_holds_the_rotor_back(table):
@@ -106,6 +102,5 @@ def test_the_theory_reproduces_the_published_map():
 
 def test_the_shipped_table_of_the_worn_rotor_is_what_the_theory_makes():
     # The table is written to the last digit; another platform's sines may round otherwise.
-    torch.testing.assert_close(
-        PowerCoefficientTable.nrel5mw(worn=True).values, torch.from_numpy(worn_values()), rtol=0, atol=1e-11
-    )
+    worn = PowerCoefficientTable.nrel5mw(worn=True).values
+    torch.testing.assert_close(worn, torch.from_numpy(worn_values()), rtol=0, atol=1e-11)
