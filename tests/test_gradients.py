@@ -71,17 +71,6 @@ class Case:
         self.action_weights = torch.randn(plant.n_steps, len(plant.actions), generator=generator).double()
         self.rollouts = {}
 
-    def refined(self, factor):
-        """The same drive and weights of the cost over the same time, on steps that are shorter by a factor."""
-        horizon, dt = self.plant.horizon, self.plant.dt
-        self.plant = type(self.plant)(dt=dt / factor, horizon=horizon)
-        self.exogenous = self.exogenous.repeat_interleave(factor, 1)
-        self.command = None if self.command is None else self.command.repeat_interleave(factor, 1)
-        self.action_weights = self.action_weights.repeat_interleave(factor, 0)
-        last = self.state_weights[-1:]
-        self.state_weights = torch.cat([self.state_weights[:-1].repeat_interleave(factor, 0), last])
-        return self
-
     def rollout(self, engine):
         """The rollout by an engine, which lasts."""
         if engine not in self.rollouts:
@@ -112,10 +101,8 @@ class Case:
 
     def gradients(self, engine):
         """The cost and its gradients, by name; zero by a weight that is not used."""
-        leaves, cost = (
-            {name: leaf.requires_grad_() for name, (leaf, _) in self.leaves().items()},
-            self.cost(engine),
-        )
+        leaves = {name: leaf.requires_grad_() for name, (leaf, _) in self.leaves().items()}
+        cost = self.cost(engine)
         found = torch.autograd.grad(cost, leaves.values(), allow_unused=True, materialize_grads=True)
         return {"cost": cost.detach(), **dict(zip(leaves, found, strict=True))}
 
@@ -175,20 +162,6 @@ def test_exact_engines_equal_autograd_and_differences(plant, closure, driver, ba
         assert slope == pytest.approx(case.difference(name, direction, 1e-5), rel=0, abs=tolerance), name
 
 
-@pytest.mark.parametrize("driver", ["commands", "policy"])
-def test_continuous_adjoint_is_of_fourth_order(driver):
-    """With a drive that is constant over 0.4 s, on ever finer steps, the gap to the exact gradient falls like dt⁴."""
-    gaps = []
-    for refinement in (1, 2, 4, 8):
-        case = Case(LinearQuadratic(dt=0.4, horizon=4.0), "perceptron", driver, 4).refined(refinement)
-        exact, reference = case.gradients("parallel"), case.gradients("odeint_adjoint")
-        gaps.append([relative_gap(reference[name], exact[name]) for name in exact])
-    total = torch.tensor(gaps).norm(dim=1)
-    orders = (total[:-1] / total[1:]).log2()
-    # One Runge-Kutta step back over each interval: local error dt⁵, so order 4 + O(dt). Measured: 4.4, 4.2, 4.1.
-    assert orders[-1].item() == pytest.approx(4.0, abs=0.2), orders
-
-
 @pytest.mark.parametrize("driver", ["commands", "policy", "perceptron"])
 @pytest.mark.parametrize("plant", sorted(PLANTS.keys() - {"pendulum"}))
 def test_continuous_adjoint_agrees(plant, driver):
@@ -243,17 +216,15 @@ class Free(LinearQuadratic):
 @pytest.mark.parametrize("engine", ["native", "parallel"])
 def test_what_an_interval_does_not_depend_on_has_a_gradient_of_zero(plant, engine):
     """The cost of both plants also depends on the action itself."""
-    system, generator = plant(horizon=1.0), seeded(0)
+    system = plant(horizon=1.0)
     closure = system.closure.requires_grad_(False)
     gradients = []
     for chosen in (engine, "autograd"):
         start = system.draw_initial_state(2, seeded(1)).requires_grad_()
         command = torch.rand(2, system.n_steps, 1, generator=seeded(2)).double().requires_grad_()
-        exogenous = system.draw_exogenous(2, generator.manual_seed(3))
-        states = Rollout(system, closure, engine=chosen)(start, exogenous, command).states
-        gradients.append(
-            torch.autograd.grad(states.square().sum(), (start, command), materialize_grads=True, allow_unused=True)
-        )
+        states = Rollout(system, closure, engine=chosen)(start, system.draw_exogenous(2, seeded(3)), command).states
+        cost = states.square().sum()
+        gradients.append(torch.autograd.grad(cost, (start, command), materialize_grads=True, allow_unused=True))
     for found, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
     assert gradients[0][0].abs().sum() > 0.0

@@ -172,14 +172,6 @@ def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
     assert fit.cost([record.part(0, 7, PLANT.dt)]) < 1e-20  # of an episode that ended before a segment does
 
 
-def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
-    twin, _ = fitted(PLANT, PLANT)
-    policy = LinearGain([[1.0, 1.0]])
-    episodes = drawn(PLANT, 4)
-    alone = twin.twins[ALONE].cost(policy, *episodes)
-    torch.testing.assert_close(twin.cost(policy, *episodes), alone, rtol=0.01, atol=0.0)
-
-
 def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
     twin, assimilation = ensemble(PLANT)
     twin.weights = {ALONE: 1.0, "late": 3.0}

@@ -11,12 +11,12 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Line, flown, line_segment
 from test_export_recipe import recipe
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Plant, PositiveCoefficients, Rollout, Signal
+from rt_torchrl import AssimilationConfig, DigitalTwin, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
-from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, state_sensors, with_biases
+from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, with_biases
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
@@ -26,11 +26,6 @@ record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
 
 ROBUST = EstimationConfig(errors="robust")
-
-
-def cost_records(plant, segments):
-    """What J_p compares along segments."""
-    return [sensor_record(plant, state_sensors(plant), segment) for segment in segments]
 
 
 def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise():
@@ -68,14 +63,6 @@ def test_actions_that_the_actuators_would_not_apply_are_told():
     # later the remembered pitch is 10 deg behind in every interval.
     share = held_back(plant, [Trajectory(states, jump, exogenous)])
     assert share["generator_torque"] == 0.0 and share["blade_pitch"] == pytest.approx(0.5, abs=0.13)
-
-
-def test_a_twin_that_diverges_at_the_start_is_told():
-    plant = LinearQuadratic(horizon=5.0)
-    records = cost_records(plant, flown(plant, torch.Generator().manual_seed(0), (50,)))
-    twin = DigitalTwin(plant, LinearClosure(torch.full((2, 2), 1e9)))
-    with pytest.raises(DivergenceError, match="diverged .* at t = .* LinearClosure.* units of what was recorded"):
-        identify(Estimation(twin, state_sensors(plant)), records, records)
 
 
 class Joints(PositiveCoefficients):
@@ -190,24 +177,22 @@ def test_a_bias_of_many_times_the_noise_is_found_and_held_out_readings_have_it_t
     assert found.held_out[1].rms[1].item() == pytest.approx(max(0.01 * size, bias - held_out), rel=0.2)
 
 
-def test_of_segments_that_are_followed_alike_the_longest_stay():
-    """Over thirds the errors are not small enough, but less than three times those over ninths."""
-    errors, closure = {0: 10.0, 2: 0.5, 30: 1.2, 10: 0.6}, LinearClosure(torch.zeros(2, 2))
+@pytest.mark.parametrize(
+    "errors",
+    [
+        {0: (10.0,), 2: (0.5,), 30: (1.2,), 10: (0.6,)},  # over thirds not small, but less than three times the least
+        {0: (2.0, 9.0), 2: (9.0, 2.0), 30: (8.0, 2.0)},  # different sensors prefer different segments
+    ],
+)
+def test_of_segments_that_are_followed_alike_the_longest_of_the_least_misfit_stay(errors):
+    closure = LinearClosure(torch.zeros(2, 2))
 
     def fit(length):
         torch.nn.init.constant_(closure.matrix, length)
-        return length, torch.tensor([errors[length]])
-
-    assert over_segments(closure, 90, fit, torch.ones(1), lambda: True) == 30 and (closure.matrix == 30.0).all()
-
-
-def test_of_segments_that_different_sensors_prefer_those_of_the_least_misfit_stay():
-    errors, closure = {0: (2.0, 9.0), 2: (9.0, 2.0), 30: (8.0, 2.0)}, LinearClosure(torch.zeros(2, 2))
-
-    def fit(length):
         return length, torch.tensor(errors.get(length, (9.0, 2.0)))
 
-    assert over_segments(closure, 90, fit, torch.ones(2), lambda: True) == 30
+    scales = torch.ones(len(errors[0]))
+    assert over_segments(closure, 90, fit, scales, lambda: True) == 30 and (closure.matrix == 30.0).all()
 
 
 class Runaway(Line):
@@ -255,16 +240,11 @@ def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
     assert training["after"] < 0.5 * training["before"] and held_out["after"] < held_out["before"]
     assert list(metrics["training"]["rms"]) == ["rotor_speed"]
     assert [steps for _, steps in metrics["log"]["segments"]] == [29, 23]
-    # 15 s and 12 s at 0.5 s, less what the jitter takes at the ends.
-    seconds = metrics["training"]["seconds"], metrics["held_out"]["seconds"]
-    assert seconds[1] / sum(seconds) == pytest.approx(0.25, abs=0.03)
     closure = SaintDrenan.from_set("Dai2016")
     closure.load_state_dict(torch.load(tmp_path / "weights.pt", weights_only=True)["closure"])
     after = [entry["after"] for entry in metrics["weights"].values()]
     assert closure.coefficients.tolist() == pytest.approx(after)
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
-        f"{name}.png" for name in ("twin_and_log", "correlations")
-    }
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"twin_and_log", "correlations"}
     shown = capsys.readouterr().out
     assert "gap from" in shown and "c8" in shown and "rotor_speed [rad/s], held out" in shown
 
@@ -281,14 +261,10 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tm
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"plant": "windmill"}, "plant='windmill' does not exist"),
         ({"columns": ()}, "no column 'time'"),
         ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
         ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
         ({"dt": 60.0}, "unstable"),
-        ({"dt": 0.0}, "dt=0.0 must be greater than 0"),
-        ({"seed": -1}, "seed=-1 must be at least 0"),
-        ({"plant": "gone.py:Room"}, "gone.py does not exist"),
         ({"plant": "rt_torchrl:Signal"}, "plant='rt_torchrl:Signal' is no class derived from Plant"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
@@ -305,9 +281,6 @@ OWN_PLANT = """
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 class Own(WindTurbine):
     name = "own"
-class Demanding(WindTurbine):
-    def __init__(self, blades):
-        super().__init__()
 """
 
 
@@ -318,8 +291,6 @@ def test_an_own_plant_is_made_by_its_file(tmp_path):
     faster = identify.Config(log=file, plant=f"{file}:Own", dt=0.25).make_plant()
     assert own.name == faster.name == "own" and (own.dt, faster.dt) == (0.5, 0.25)
     assert own.horizon == faster.horizon
-    with pytest.raises(ValueError, match="cannot be made .*blades.*its options must have defaults"):
-        identify.Config(log=file, plant=f"{file}:Demanding").make_plant()
 
 
 def test_whole_records_are_fitted_again_from_what_short_segments_tell():

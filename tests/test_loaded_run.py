@@ -1,8 +1,6 @@
 """Runs of every recipe are loaded again, found by what they say, and flown without a training."""
 
-import contextlib
 import dataclasses
-import io
 import json
 import runpy
 import shutil
@@ -25,7 +23,6 @@ from rt_torchrl.options import choices
 from rt_torchrl.runs import settings as settings_module
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.steps import interact
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.systems.sound_part import SoundPart, sound_part
@@ -70,21 +67,14 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize(
-    "plant", [pytest.param("wind_turbine", marks=pytest.mark.slow), "flapping_wing", "cryogenic_tank"]
-)
-def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path, monkeypatch):
-    made, drawn = load_recipe(RECIPES / f"{plant}.py"), plant == "wind_turbine"
-    twinning = SMALL if drawn else dataclasses.replace(SMALL, arm="model_free")
-    small = {"episodes": 1, "unseen": 2, "figures": drawn, "twinning": twinning}
-    config = made.Config(**CHOICES[plant], **small, policy="mlp", hidden=(3,), log_dir=tmp_path)
-    made.main(config)
-    run = load_run(tmp_path)
-    assert settings_of(run.config, plant) == settings_of(config, plant) and run.plant.cost == config.plant().cost
-    assert run.plant.observations == config.plant().observations != made.Config().plant().observations
-    assert (tmp_path / "figures" / "exogenous.png").exists() == drawn
+@pytest.mark.parametrize("plant", CHOICES)
+def test_a_run_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path):
+    config, _ = leave_run(tmp_path, plant, **CHOICES[plant])
+    run, usual = load_run(tmp_path), type(config)().plant()
+    assert run.config == config and run.plant.cost == config.plant().cost != usual.cost
+    assert run.plant.observations == config.plant().observations != usual.observations
     with pytest.raises(ValueError, match="observe is"):
-        made.main(dataclasses.replace(config, observe=("paper",), resume=True))
+        load_recipe(RECIPES / f"{plant}.py").main(dataclasses.replace(config, observe=("paper",), resume=True))
 
 
 ROOM = """
@@ -113,31 +103,21 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture(scope="module")
-def own_run(tmp_path_factory):
-    """A run of a script of the user's own, whose plant lies in a file beside it; both are forgotten again."""
-    folder = tmp_path_factory.mktemp("own")
-    (folder / "room.py").write_text(ROOM)
-    (folder / "train.py").write_text(TRAIN)
-    (folder / "run").mkdir()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as shown:
-        patch.syspath_prepend(folder)
-        patch.setattr("sys.argv", ["train.py", str(folder / "run")])
-        runpy.run_path(str(folder / "train.py"), run_name="__main__")
+def test_a_run_of_an_own_script_is_loaded_without_naming_it_and_exported(tmp_path, capsys):
+    """The plant lies in a file beside it; both are forgotten again."""
+    for name, text in (("room.py", ROOM), ("train.py", TRAIN)):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "run").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        patch.setattr("sys.argv", ["train.py", str(tmp_path / "run")])
+        runpy.run_path(str(tmp_path / "train.py"), run_name="__main__")
     del sys.modules["room"]
-    assert shown.getvalue() == "runs\n"  # load_run has not run the script again that is under way
-    return folder
-
-
-def test_a_run_of_an_own_script_is_loaded_without_naming_it(own_run):
-    run = load_run(str(own_run / "run"))
+    assert capsys.readouterr().out == "runs\n"  # load_run has not run the script again that is under way
+    run, export = load_run(str(tmp_path / "run")), recipe("export")
     assert run.plant.name == "room" and run.plant.horizon == run.config.horizon == 2.0
-
-
-def test_an_own_recipe_is_exported_with_the_plant_beside_it(own_run, tmp_path):
-    export = recipe("export")
-    for given in (None, str(own_run / "train.py")):
-        export.main(export.Config(run=own_run / "run", recipe=given, formats=("pt2",), output=tmp_path))
+    for given in (None, str(tmp_path / "train.py")):
+        export.main(export.Config(run=tmp_path / "run", recipe=given, formats=("pt2",), output=tmp_path))
         (tmp_path / "room_model_based.pt2").unlink()
 
 
@@ -149,8 +129,6 @@ def test_a_plant_that_no_recipe_makes_is_given(tmp_path, unchecked):
     parts = leave_run_of(tmp_path, Own(), LinearQuadratic())
     with pytest.raises(ValueError, match=r"Own has no method plant\(\).*give load_run the plant"):
         load_run(tmp_path)
-    with pytest.raises(ValueError, match=r"plant=<class .* must be a plant; if this is a class, give an instance"):
-        load_run(tmp_path, plant=LinearQuadratic)
     run = load_run(tmp_path, plant=LinearQuadratic())
     with pytest.raises(ValueError, match="policy=<function .* must be an nn.Module from observations to actions"):
         run.simulate(lambda observation: observation[..., :1])
@@ -166,26 +144,17 @@ def name_recipe(folder, file, name="Config"):
 
 def test_recipes_that_cannot_be_found_are_told(tmp_path):
     leave_run_of(tmp_path, Own(), LinearQuadratic())
-    settings = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(settings | {"recipe": 0}))
-    with pytest.raises(ValueError, match="does not say in which file the class is .*give the recipe: its file"):
-        load_run(tmp_path, plant=LinearQuadratic())
     for name, file, message in (
         ("make.<locals>.Config", settings_module.__file__, "defines no make.*If it has moved"),
         ("Config", None, "does not say in which file"),
         ("Config", "/gone.py", "/gone.py does not exist.*If it has moved"),
-        ("Config", settings_module.__file__, "defines no Config.*If it has moved"),
         ("Path", settings_module.__file__, "Path is no class derived from RunConf"),
     ):
         name_recipe(tmp_path, file, name)
         with pytest.raises(ValueError, match=message):
             load_run(tmp_path, plant=LinearQuadratic())
-    for given, message in {
-        "gone.py": "gone.py does not exist",
-        str(tmp_path / "config.json"): "config.json is no Python code, by its name; give a file that ends in .py",
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            load_run(tmp_path, given)
+    with pytest.raises(ValueError, match="config.json is no Python code, by its name; give a file that ends in .py"):
+        load_run(tmp_path, str(tmp_path / "config.json"))
 
 
 CALLED = "open({mark!r}, 'w').close()\nraise SystemExit('code of the run folder')\n"
@@ -263,8 +232,6 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     assert found.cost(policy, *episodes) == trained.cost(policy, *episodes)
     for name, twin in trained.twins.items():
         require_same_weights(found.twins[name].closure, twin.closure)
-    fresh = Suspecting(horizon=2.0).suspects()["lags"].closure.state_dict()
-    assert any(not torch.equal(value, found.twins["lags"].closure.state_dict()[key]) for key, value in fresh.items())
     with pytest.raises(
         ValueError, match=r"hypotheses in .*weights.pt do not fit: plant 'linear_quadratic' suspects no"
     ):
@@ -307,7 +274,6 @@ def test_impossible_requests_are_refused(run):
     for arguments, message in (
         ({"on": "model"}, "on='model' must be real or twin"),
         ({"exogenous": torch.ones(5, 3)}, "a column for each input"),
-        ({"exogenous": torch.ones(5)}, "a row for each control interval"),
         ({"initial_state": torch.ones(2)}, r"initial_state of shape \(2,\) must have the shape \(6,\)"),
         ({"exogenous": torch.ones(2, 5, 1), "initial_state": torch.ones(3, 6)}, "has 2 episodes, others 3"),
     ):
@@ -319,10 +285,8 @@ def test_impossible_requests_are_refused(run):
 
 def test_figures_show_the_episode_that_is_given(run):
     flown = run.simulate(run.policy("model_based"), torch.full((30, 1), 12.5), seed=5)
-    ax = run.figure("states", flown).axes[0]
-    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
+    drawn = {line.get_label(): line.get_ydata() for line in run.figure("states", flown).axes[0].lines}
     assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy()) and "twin" in drawn
-    assert any(word.startswith("Real and twin states, one flight") for word in draw(run.figure("states", flown)))
     assert {"states", "learning_curves", "power_and_speed"} <= set(run.figure_names())
 
 
@@ -340,7 +304,5 @@ def test_figures_show_the_twin_of_a_plant_without_inputs_and_end_with_the_episod
 
 def test_figures_call_a_flight_on_the_twin_so(run):
     flown = run.simulate(run.policy("model_based"), torch.full((2, 30, 1), 12.5), on="twin")
-    for name, title in {"states": "States", "power_and_speed": "Power and speed"}.items():
-        found = draw(run.figure(name, flown))
-        assert f"{title}, flight on the twin" in found and "real" not in found
-    assert not any(word.startswith("RMS") for word in draw(run.figure("states", flown)))
+    found = draw(run.figure("states", flown))
+    assert "States, flight on the twin" in found and "real" not in found

@@ -108,7 +108,7 @@ def test_columns_are_as_the_header_says(tmp_path, change):
     assert found["force"] == [1.0, 1.0, -1.0] and found["disturbance"] == [0.0, 0.25, 0.5]
 
 
-@pytest.mark.parametrize("suffix", ["csv", "CSV", "parquet", "Parquet"])
+@pytest.mark.parametrize("suffix", ["csv", "CSV", "Parquet"])
 @pytest.mark.parametrize("index", [False, True])
 def test_times_may_be_durations_and_an_index(tmp_path, suffix, index):
     import pandas as pd
@@ -120,9 +120,6 @@ def test_times_may_be_durations_and_an_index(tmp_path, suffix, index):
         table.to_csv(path, index=index)
     else:
         pytest.importorskip("pyarrow")
-        table.assign(velocity=pd.to_datetime("2024-03-31")).to_parquet(path)
-        with pytest.raises(ValueError, match="column 'velocity' .* holds dates; velocity needs numbers"):
-            read_log(path, PLANT)
         table.to_parquet(path)
     log = read_log(path, PLANT)
     assert log.times.tolist() == [30.0, 90.5, 3600.0] and log.columns["force"].tolist() == [1.0, 2.0, 3.0]
@@ -178,8 +175,6 @@ def test_the_turbine_completes_its_filters():
     given = torch.full((plant.n_steps + 1,), 9.0, dtype=torch.float64)
     measured = {"rotor_speed": flown.states[0, :, 0], "filtered_wind_speed": given}
     assert torch.equal(plant.complete_states(measured, wind[0], flown.actions[0])[:, 2], given)
-    with pytest.raises(ValueError, match="rotor_speed"):
-        plant.complete_states({}, wind[0], flown.actions[0])
 
 
 def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
@@ -195,8 +190,6 @@ def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
         np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=0, atol=1e-9)
     noisy = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(0), noise=0.05)
     assert np.abs(noisy.columns["angle"]).max() <= math.pi and checked(noisy, plant) is noisy
-    with pytest.raises(ValueError, match="jitter=0.4: plant 'pendulum' steps by a scheme of its own.*jitter=0"):
-        recorded(plant, policy_law(plant, policy), torch.Generator(), jitter=0.4)
 
 
 @pytest.mark.parametrize(

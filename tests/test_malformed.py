@@ -17,9 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl import OperatingLimits, OperatingLimitsConfig, RunConfig
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl import RunConfig
 from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import GREATEST_SPEED, read_wind
 from rt_torchrl.fit.log import SensorLog, checked, read_log
@@ -245,10 +243,3 @@ def test_a_file_of_tensors_that_would_grow_is_refused(tmp_path, compressed):
 
 
 # The constructor with the value in another unit; the beginning of the message; what the message says of that unit.
-
-
-def test_what_is_right_is_taken():
-    FlappingWing(mass=3.5e-3)
-    OperatingLimits(
-        Pendulum(), OperatingLimitsConfig(states={"angle": (-math.pi / 2, math.inf)}, rates={"torque": 40.0})
-    )

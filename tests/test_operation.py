@@ -207,13 +207,10 @@ class Clock(torch.nn.Module):
     """State feedback that keeps the times at which it acted, and has nothing to report before."""
 
     begin = fly = lambda self: None
-
-    def __init__(self):
-        super().__init__()
-        self.times = []
+    times = ()
 
     def act(self, t, state, exogenous):
-        self.times.append(round(t / PLANT.dt))
+        self.times = (*self.times, round(t / PLANT.dt))
         return torch.zeros(1, 1).double()
 
     def report(self):
@@ -225,27 +222,25 @@ def test_a_fallback_has_the_clock_of_the_window():
     found = operated(machine(fallback=fallback), continuous=True)
     for _ in range(2):
         found.episode()
-    assert fallback.times == [*range(30)] * 2
+    assert fallback.times == (*range(30), *range(30))
 
 
-class Unreachable(PlantEnv):
+def unreachable(fails):
     """A system that fails in one of its resets, which are counted from 1."""
+    system, resets = Stepped(PLANT), itertools.count(1)
+    reset = system._reset
 
-    resets = 0
-
-    def __init__(self, plant, fails=3):
-        super().__init__(plant)
-        self.fails = fails
-
-    def _reset(self, *args, **options):
-        self.resets += 1
-        if self.resets == self.fails:
+    def failing(*args, **options):
+        if next(resets) == fails:
             raise ConnectionError("no answer")
-        return super()._reset(*args, **options)
+        return reset(*args, **options)
+
+    system._reset = failing
+    return system
 
 
 def test_a_reset_that_fails_is_tried_again():
-    found = twinning(lambda *parts: InProcess(*parts, Unreachable(PLANT)), PLANT)
+    found = twinning(lambda *parts: InProcess(*parts, unreachable(3)), PLANT)
     reports = [found.episode() for _ in range(4)]
     assert reports[2]["episodes_refused"] == 1
     assert "failed in its reset: ConnectionError: no answer" in reports[2]["refusal"]
@@ -253,7 +248,7 @@ def test_a_reset_that_fails_is_tried_again():
 
 
 def test_state_feedback_that_has_not_acted_reports_nothing():
-    found = InProcess(PLANT, {"one": Clock()}, QUIET, Unreachable(PLANT, fails=1))
+    found = InProcess(PLANT, {"one": Clock()}, QUIET, unreachable(1))
     found.hand_over("one", Clock(), strength=0.0)
     with pytest.raises(EpisodeEndedError, match="failed in its reset: ConnectionError: no answer"):
         found.rollout()
@@ -299,18 +294,11 @@ def operation(make_env, **options):
         found.close()
 
 
-@pytest.mark.parametrize(
-    "options, expected",
-    [
-        ({}, 0),
-        ({"asynchronous": True}, 2),
-        ({"asynchronous": True, "threads": 7}, 7),
-    ],
-)
-def test_the_learner_leaves_a_core_to_what_acts(options, expected, monkeypatch):
+def test_the_learner_leaves_a_core_to_what_acts(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    assert learner_threads(RunConfig(**options)) == expected
+    for options, expected in ({}, 0), ({"asynchronous": True}, 2), ({"asynchronous": True, "threads": 7}, 7):
+        assert learner_threads(RunConfig(**options)) == expected
 
 
 @pytest.mark.slow
@@ -357,34 +345,26 @@ def test_a_run_goes_on_after_a_stop(tmp_path):
     assert len(found["episodes"]) > 2
 
 
-@pytest.mark.parametrize(
-    ("make_env", "continuous", "message"),
-    [
+def test_what_cannot_operate_is_refused(tmp_path):
+    for make_env, continuous, message in (
         (lambda: PlantEnv(SHORT), False, "cannot be sent to a process of its own"),
         (breaking, True, "continuous operation needs a RealSystem.*Breaking does not"),
-    ],
-)
-def test_what_cannot_operate_is_refused(make_env, continuous, message):
-    with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
-        pass
-
-
-def test_a_real_system_that_only_the_learner_has_is_refused(tmp_path):
+    ):
+        with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
+            pass
     with pytest.raises(ValueError, match=r"give Run\(..., env=\) a function that makes it"):
         small_run(tmp_path, plant=PLANT, parts={"env": machine()}, asynchronous=True)
 
 
 def test_the_first_controller_goes_on_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):
     monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
-    plant, controller = LinearQuadratic(horizon=2.0), PD(LinearQuadratic(horizon=2.0), (0.4, 0.3))
-    found = twinning(
-        lambda plant, policies, exploration: InProcess(
-            plant, {FIRST: controller, **policies}, exploration, Stepped(plant)
-        ),
-        plant,
-        first=FirstController(controller),
-        planner=PlannerConfig(iterations=0, starts=0),
-    )
+    plant = LinearQuadratic(horizon=2.0)
+    controller, planner = PD(plant, (0.4, 0.3)), PlannerConfig(iterations=0, starts=0)
+
+    def system(plant, policies, exploration):
+        return InProcess(plant, {FIRST: controller, **policies}, exploration, Stepped(plant))
+
+    found = twinning(system, plant, first=FirstController(controller), planner=planner)
     with torch.no_grad():
         for policy in found.policies.values():
             policy.gain.fill_(-1.0)

@@ -14,7 +14,6 @@ from test_algorithm import flown, twinning
 from test_classical import PD
 from test_early_ends import STRONG, WEAK, Falling
 from test_real_system import Rig, connected
-from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl import PlantEnv, Reading, RealSystem, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
@@ -24,11 +23,11 @@ STEPS = 20
 
 
 class Machine(Rig):
-    """A rig that counts its resets, and keeps the actions of every flight and what the plant says that it costs."""
+    """A rig that counts its resets, keeps the actions and the cost of every flight, and fails where a test says so."""
 
     def __init__(self, plant, **options):
         super().__init__(plant, **options)
-        self.resets, self.flights, self.costs = 0, [], []
+        self.resets, self.flights, self.costs, self.fails_at = 0, [], [], None
 
     def _reset(self, tensordict=None, **kwargs):
         self.resets += 1
@@ -38,6 +37,8 @@ class Machine(Rig):
         if self.count == 0:
             self.flights.append([])
             self.costs.append(0.0)
+        if self.count == self.fails_at:
+            raise ConnectionError("no answer")
         s, z, plant = self.found["state"], self.found["exogenous"], self.inner.plant
         seen, told = self.found["observation"], super()._step(tensordict)
         t = torch.full((1,), (self.count - 1) * plant.dt).double()
@@ -71,26 +72,19 @@ def machine():
     return Machine(LinearQuadratic(horizon=2.0))
 
 
-def test_a_training_flies_its_episodes_and_nothing_else(tmp_path, capsys):
+def test_a_training_flies_its_episodes_and_nothing_else_and_is_judged_on_the_twin(tmp_path, capsys):
     """Neither the policies, trained or not, nor random ones, are judged on a system that is not ours unasked."""
     rig = machine()
-    metrics = run_on(rig, tmp_path, unseen_every=1).train()
+    run = run_on(rig, tmp_path, unseen_every=1)
+    summary = run.train()["summary"]
     assert (rig.resets, len(rig.flights)) == (2, 2)
-    summary = metrics["summary"]
     assert "real_unseen" not in summary and summary["unseen"]["judged_on"] == "twin"
-    paid = summary["cost_of_learning"]
+    paid, unseen, said = summary["cost_of_learning"], summary["unseen"], capsys.readouterr().out
     assert paid["episodes"] == 2 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
-    said = capsys.readouterr().out
     assert "judged on 3 unseen ones on the twin" in said and "flights on the real system" not in said
-
-
-def test_costs_on_the_twin_are_called_so_in_every_cell(tmp_path, capsys):
-    """A J_p on episodes that only the twin has flown would be zero; there is none."""
-    rig = machine()
-    run = run_on(rig, tmp_path)
-    unseen = run.train()["summary"]["unseen"]
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith("J_a ")]
+    rows = [line for line in said.splitlines() if line.lstrip().startswith("J_a ")]
     assert len(rows) == 2 and all("on the twin" in row for row in rows)
+    # A J_p on episodes that only the twin has flown would be zero; there is none.
     assert unseen["J_p"]["mean"] is None and unseen["J_p_before"]["mean"] is None
     # The same flights in a loop of our own, under the law that the twin has found.
     twin, policy, plant = run.algorithm.twin, run.algorithm.policies["model_based"], rig.inner.plant
@@ -160,23 +154,31 @@ def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
     assert "ratio" not in entries(plant, flights, judged, "live")["controllers"]["weak"]
 
 
+class Tracking(PD):
+    """A PD law that cancels the disturbance that is measured."""
+
+    def law(self, state, memory, exogenous):
+        command, memory = super().law(state, memory, exogenous)
+        return command - exogenous, memory
+
+
 def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     rig = machine()
-    Asked.rig = rig
-    run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, baselines={"cascade": Asked})
+    Asked.rig, options = rig, {"real_unseen": 2, "start": "controller", "first": PD, "figures": True}
+    run = run_on(rig, tmp_path, baselines={"cascade": Asked, "mine": Tracking}, **options)
     metrics = run.train()
-    # The controller's episode, two episodes, and then the live policy, the first controller and the cascade.
-    assert len(rig.flights) == 3 + 2 * 3
+    # The controller's episode, two episodes, and then the live policy, the cascade and two classical controllers.
+    assert len(rig.flights) == 3 + 2 * 4
     summary, said = metrics["summary"], capsys.readouterr().out
     live = summary["live"]
     words = live.replace("_", "-")
-    assert f"6 flights on the real system: 2 of the live policy ({words}), 2 of cascade, 2 of PD" in said
+    assert f"8 flights on the real system: 2 of the live policy ({words}), 2 of cascade, 2 of mine, 2 of PD" in said
     assert "J_a on the real system, 2 other episodes of PD: " in said
     paid = summary["cost_of_learning"]
-    assert paid["episodes"] == 9 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
+    assert paid["episodes"] == 11 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)
     costs, flown = summary["real_unseen"]["costs"], summary["real_unseen"]["controllers"]
-    assert [*costs] == [live, "cascade", "PD"]
+    assert [*costs] == [live, "cascade", "mine", "PD"] and (tmp_path / "figures" / "flights.png").is_file()
     assert "ratio" not in flown[live] and flown["PD"]["cheaper"] == sum(map(operator.lt, costs[live], costs["PD"]))
     ratio, pairs = flown["PD"]["ratio"], [live / other for live, other in zip(costs[live], costs["PD"], strict=True)]
     assert ratio["mean"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
@@ -190,23 +192,7 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     for observation, applied in rig.flights[3] + rig.flights[4]:
         wanted = policy(observation).detach().clamp(-2.0, 2.0)  # within the range of the action
         torch.testing.assert_close(applied, wanted, rtol=1e-9, atol=1e-12)
-
-
-class Tracking(PD):
-    """A PD law that cancels the disturbance that is measured."""
-
-    def law(self, state, memory, exogenous):
-        command, memory = super().law(state, memory, exogenous)
-        return command - exogenous, memory
-
-
-def test_a_classical_controller_is_judged_on_the_episodes_of_the_policies_where_nobody_knows_the_closure(
-    tmp_path, capsys
-):
-    """On the twin as it is at the end, and in the flights that are asked for; both in loops of our own."""
-    rig = machine()
-    run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, baselines={"mine": Tracking}, figures=True)
-    summary = run.train()["summary"]
+    # A classical controller is judged on the twin as it is at the end, too; here in a loop of our own.
     plant, twin = rig.inner.plant, run.algorithm.twin.believed
     law = Tracking(plant)
     memory = [law.first_memory(run.unseen.initial_state)]
@@ -215,14 +201,8 @@ def test_a_classical_controller_is_judged_on_the_episodes_of_the_policies_where_
         command, memory[0] = law.respond(s, memory[0], z)
         return command
 
-    costs = costs_by_hand(plant, twin.closure, run.unseen, act)
-    unseen = summary["unseen"]
-    assert [*unseen["baselines"]] == ["mine", "PD"] and unseen["judged_on"] == "twin"
-    assert unseen["baselines"]["mine"]["J_a"]["mean"] == pytest.approx(costs.mean().item(), rel=1e-9)
-    flights = summary["real_unseen"]["costs"]
-    assert [*flights] == [summary["live"], "mine", "PD"] and len(rig.flights) == 1 + 2 + 3 * 2
-    assert flights["mine"] == pytest.approx(rig.costs[5:7], rel=1e-9)
-    assert (tmp_path / "figures" / "flights.png").is_file() and "mine" in capsys.readouterr().out
+    mean, baselines = costs_by_hand(plant, twin.closure, run.unseen, act).mean().item(), summary["unseen"]["baselines"]
+    assert [*baselines] == ["mine", "PD"] and baselines["mine"]["J_a"]["mean"] == pytest.approx(mean, rel=1e-9)
 
 
 def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_path):
@@ -233,21 +213,17 @@ def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_pat
 
 
 def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
-    """The model-free arm acts; without iterations its weights are still the random ones."""
-    rig = machine()
-    run = run_on(rig, tmp_path, real_unseen=2, twinning=dataclasses.replace(FULL, arm="model_free", learner=IDLE))
-    metrics = run.train()
-    live = metrics["summary"]["live"]
-    weights = [parameters_to_vector(each[live].parameters()) for each in (run.initial_policies, run.algorithm.policies)]
-    assert torch.equal(*weights)
-    assert len(rig.flights) == 2 and "real_unseen" not in metrics["summary"]
-    assert "random initial weights" in capsys.readouterr().out
-    # Controllers that fly where it does not are compared with no policy.
-    options = {"real_unseen": 2, "twinning": dataclasses.replace(FULL, arm="model_free", learner=IDLE)}
-    found = run_on(machine(), tmp_path / "beside", baselines={"PD": PD, "mine": Tracking}, **options).train()["summary"]
-    flown = found["real_unseen"]["controllers"]
+    """The model-free arm acts; without iterations its weights are still the random ones.
+
+    Controllers that fly where it does not are compared with no policy.
+    """
+    rig, twinning = machine(), dataclasses.replace(FULL, arm="model_free", learner=IDLE)
+    run = run_on(rig, tmp_path, real_unseen=2, twinning=twinning, baselines={"PD": PD, "mine": Tracking})
+    flown = run.train()["summary"]["real_unseen"]["controllers"]
     assert [*flown] == ["PD", "mine"] and not any("ratio" in one for one in flown.values())
-    assert "the live policy costs" not in capsys.readouterr().out
+    assert len(rig.flights) == 2 + 2 * 2
+    said = capsys.readouterr().out
+    assert "random initial weights" in said and "the live policy costs" not in said
 
 
 def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
@@ -269,7 +245,7 @@ def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_p
     "cause", ["the environment terminated the episode after 5 of 20", "ConnectionError: no answer"]
 )
 def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_training(tmp_path, capsys, cause):
-    rig = Judged(LinearQuadratic(horizon=2.0))
+    rig = machine()
 
     def fail(episodes):
         if len(episodes) == 2:
@@ -281,23 +257,17 @@ def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_traini
     assert f"PD is not judged on the real system: the system failed in interval 4, at 0.4 s: {cause}" in said
 
 
-def test_what_was_paid_for_judging_stays_paid_when_a_run_goes_on(tmp_path):
-    rig = machine()
-    run_on(rig, tmp_path, real_unseen=2).train()
-    paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]
-    assert len(rig.flights) == 2 + 2 == paid["episodes"]
-    assert paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
-
-
 def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
     rig = machine()
     first = run_on(rig, tmp_path, real_unseen=2).train()["summary"]
     again = run_on(rig, tmp_path, real_unseen=2, resume=True).train()["summary"]
     assert len(rig.flights) == 2 + 2 and again["real_unseen"] == first["real_unseen"]
     assert again["cost_of_learning"] == first["cost_of_learning"]
-    # A controller that has not flown yet flies, and so does the policy beside it.
+    # A controller that has not flown yet flies, and so does the policy beside it; what was paid before stays paid.
     run_on(rig, tmp_path, real_unseen=2, resume=True, baselines={"mine": Tracking}).train()
-    assert len(rig.flights) == 2 + 2 + 2 * 2
+    paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]
+    assert len(rig.flights) == 2 + 2 + 2 * 2 == paid["episodes"]
+    assert paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
 
 
 def test_after_an_interrupt_nothing_flies(tmp_path):
@@ -321,48 +291,25 @@ def test_a_system_with_a_known_closure_is_simulated_and_the_table_says_so(tmp_pa
 # Real episodes of the algorithm: one reset each, what the system draws, who steps it, and what a failure leaves.
 
 
-HORIZON = 2.0
-
-
-class Judged(Rig):
-    """A rig that counts what is done to it, and fails in a step where the test says so."""
-
-    def __init__(self, plant, **options):
-        super().__init__(plant, **options)
-        self.done, self.fails_at = [], None
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.done.append("reset")
-        return super()._reset(tensordict, **kwargs)
-
-    def _step(self, tensordict):
-        self.done.append("step")
-        if self.count == self.fails_at:
-            raise ConnectionError("no answer")
-        return super()._step(tensordict)
-
-
 def test_after_a_failure_the_next_episode_begins_with_a_reset():
-    plant = LinearQuadratic(horizon=HORIZON)
-    machine = Judged(plant)
-    found = twinning(env=connected(plant, rig=machine))
+    rig = machine()
+    found = twinning(env=connected(rig.inner.plant, rig=rig))
     found.episode()
-    assert machine.done == ["reset", *["step"] * 20]
-    machine.fails_at = 7  # too little of the episode is sound then
+    assert (rig.resets, [len(flight) for flight in rig.flights]) == (1, [20])
+    rig.fails_at = 7  # too little of the episode is sound then
     for _ in range(2):
         with pytest.raises(ValueError, match="3 real episodes in a row .*in interval 7, at 0.7 s: Connection"):
             found.episode()
     assert len(found.learner.memory) == 20 and len(found.short_term) == 1 and found.episodes_done == 1
-    machine.fails_at = None
-    machine.done.clear()
+    rig.fails_at, failed = None, rig.resets
     assert found.episode()["real_cost"].isfinite()
-    assert machine.done == ["reset", *["step"] * 20] and len(found.learner.memory) == 40
+    assert rig.resets == failed + 1 and len(rig.flights[-1]) == 20 and len(found.learner.memory) == 40
 
 
 @pytest.mark.parametrize("guarded", [False, True])
 def test_episodes_of_a_simulation_are_every_second_draw_of_its_seed(guarded):
     """As in version 0.1, whose figures rest on them."""
-    plant = LinearQuadratic(horizon=HORIZON)
+    plant = LinearQuadratic(horizon=2.0)
     env = PlantEnv(plant, seed=4)
     found = twinning(env=SafetyLayer(env, SafetyConfig(interval=0.1), fallback=(0.0,)) if guarded else env)
     generator = torch.Generator().manual_seed(4)

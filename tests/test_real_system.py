@@ -10,7 +10,6 @@ import pytest
 import scipy.linalg
 import torch
 from linear_quadratic import LinearQuadratic
-from small_runs import SMALL
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
@@ -124,26 +123,6 @@ def test_an_episode_of_gymnasium_takes_one_reset_with_its_own_seed(layer):
     assert torch.equal(system.reset()["state"][0], starts[0]) and not torch.equal(starts[0], starts[1])
 
 
-def run_on(env, folder, *, figures=False, **options):
-    own = {"unseen": 3, "figures": figures, "twinning": SMALL}
-    config = RunConfig(log_dir=folder, **own, **options)
-    return Run(config, LinearQuadratic(horizon=2.0), env=env)
-
-
-def test_a_tuple_of_gymnasium_is_refused_until_it_is_flattened():
-    plant = Pendulum(horizon=1.0)
-    pendulum = gymnasium.make("Pendulum-v1")
-    parts = gymnasium.spaces.Tuple([gymnasium.spaces.Box(-8.0, 8.0, (n,)) for n in (2, 1)])
-    env = gymnasium.wrappers.TransformObservation(pendulum, lambda seen: (seen[:2], seen[2:]), parts)
-    with pytest.raises(ValueError, match=r"state is read from \['observation'\], .* a tuple of arrays; .*Flatten"):
-        RealSystem(GymWrapper(env), plant, state=Reading(of=angle_and_speed))
-    flat = RealSystem(
-        GymWrapper(gymnasium.wrappers.FlattenObservation(env)), plant, state=Reading(of=angle_and_speed), seed=1
-    )
-    whole = RealSystem(GymWrapper(pendulum), plant, state=Reading(of=angle_and_speed), seed=1)
-    torch.testing.assert_close(flat.reset()["state"], whole.reset()["state"])
-
-
 def test_a_constant_stands_in_for_an_input_that_is_not_reported():
     found = connected(LinearQuadratic(), exogenous=(0.3,)).reset()
     assert found["exogenous"].tolist() == [[0.3]]
@@ -183,8 +162,9 @@ def test_a_reading_that_is_not_finite_is_refused():
 
 @pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])
 def test_options_of_a_simulation_are_refused(options, tmp_path):
+    plant = LinearQuadratic(horizon=2.0)
     with pytest.raises(ValueError, match="real system"):
-        run_on(connected(LinearQuadratic(horizon=2.0)), tmp_path, **options)
+        Run(RunConfig(log_dir=tmp_path, **options), plant, env=connected(plant))
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -329,16 +309,3 @@ def test_a_report_that_is_not_as_declared_is_refused(reported):
     with pytest.raises(ValueError, match="place and rate=.* must be 2 numbers"):
         env.reset()
     env.close()
-
-
-def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
-    def run(folder, episodes, **options):
-        plant = LinearQuadratic(horizon=2.0)
-        return run_on(connected(plant, closure=plant.closure), folder, episodes=episodes, **options).train()
-
-    whole = run(tmp_path / "whole", 3)
-    run(tmp_path / "parts", 2)
-    parts = run(tmp_path / "parts", 3, resume=True)
-    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
-        assert {**one, "seconds": None} == {**other, "seconds": None}
-    assert "true" in whole["summary"]["closure"]

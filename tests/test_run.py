@@ -38,42 +38,32 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert {path.name for path in tmp_path.glob("checkpoint*")} == kept
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert [record["episode"] for record in metrics["episodes"]] == [1, 2, 3, 4]
-    promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
-    assert all(promised <= record.keys() for record in metrics["episodes"])
-    summary = metrics["summary"]
-    assert {"J_p_ratio", "J_a_ratio_model_based", "J_a_ratio_model_free", "unseen", "closure", "seconds"} <= set(
-        summary
-    )
-    assert {"J_p", "J_a_model_based", "J_a_model_free"} <= set(summary["unseen"])
+    promised, summary = {"J_p", "J_a_model_based", "J_a_model_free"}, metrics["summary"]
+    assert all(promised | {"live", "real_cost", "event", "seconds"} <= record.keys() for record in metrics["episodes"])
+    ratios = {"J_p_ratio", "J_a_ratio_model_based", "J_a_ratio_model_free"}
+    assert ratios | {"unseen", "closure", "seconds"} <= set(summary) and promised <= set(summary["unseen"])
     assert json.loads((tmp_path / "config.json").read_text())["episodes"] == 4
     assert {"states.png", "learning_curves.png"} <= {path.name for path in (tmp_path / "figures").iterdir()}
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    logged = [event.value for event in events.Scalars("twin/J_p")]
+    logged = [event.value for event in EventAccumulator(str(tmp_path)).Reload().Scalars("twin/J_p")]
     # TensorBoard keeps single precision.
-    records = metrics["episodes"]
-    assert logged == pytest.approx([record["J_p"] for record in records], rel=1e-6)
+    assert logged == pytest.approx([record["J_p"] for record in metrics["episodes"]], rel=1e-6)
     each = summary["unseen"]["J_p_each"]
     assert len(each) == 3 and sum(each) / 3 == pytest.approx(summary["unseen"]["J_p"]["mean"], rel=1e-12)
 
 
-def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
-    run = small_run(tmp_path)
-    found = run.train()["summary"]
+def test_ratios_are_costs_after_over_costs_before_on_the_unseen_episodes(tmp_path):
+    run = small_run(tmp_path, episodes=4, unseen_every=2)
+    metrics = run.train()
+    found = metrics["summary"]
     before, after = (
         stepped_cost(run.unseen, policies["model_based"]) for policies in (run.initial_policies, run.algorithm.policies)
     )
     # Sums in another order: rounding only.
     assert found["J_a_ratio_model_based"] == pytest.approx(after / before, rel=1e-12)
-
-
-def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
-    run = small_run(tmp_path, episodes=4, unseen_every=2)
-    metrics = run.train()
+    # The live policy is judged on them during the training where that is asked for.
     assert ["J_a_unseen" in record for record in metrics["episodes"]] == [False, True, False, True]
-    live = metrics["summary"]["live"]
+    mean = found["unseen"][f"J_a_{found['live']}"]["mean"]
     # Two libraries sum the costs, in an order that depends on the machine.
-    mean = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
     assert metrics["episodes"][3]["J_a_unseen"] == pytest.approx(mean, rel=1e-14)
 
 
@@ -93,18 +83,16 @@ def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
         shown.update(flown)
         return draw(physics, flown, **options)
 
+    def idle(episodes):
+        for policy in run.algorithm.policies.values():
+            policy.gain.data.zero_()
+
     monkeypatch.setattr(drawings, "flights", kept)
-    parts = {
-        "callbacks": [
-            lambda episodes: [policy.gain.data.zero_() for policy in run.algorithm.policies.values()] and None
-        ]
-    }
-    run = small_run(tmp_path, 1, plant, figures=True, parts=parts)
+    run = small_run(tmp_path, 1, plant, figures=True, parts={"callbacks": [idle]})
     run.train()
     (flown,) = shown.values()
-    assert len(flown.actions) < plant.n_steps and plant.ended(flown.states).tolist() == [False] * len(flown.actions) + [
-        True
-    ]
+    *going_on, ended = plant.ended(flown.states).tolist()
+    assert len(flown.actions) < plant.n_steps and ended and not any(going_on)
 
 
 def test_the_twin_follows_a_system_that_wears(tmp_path):
@@ -133,15 +121,6 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     replayed = Rollout(twin.plant, twin.closure)(run.unseen.initial_state, run.unseen.exogenous, flown.actions)
     expected = identification_cost(twin.plant, replayed, flown.states).mean().item()
     assert found["unseen"]["J_p"]["mean"] == pytest.approx(expected, rel=1e-9)
-
-
-def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
-    whole = small_run(tmp_path / "whole", episodes=4, twinning=FULL).train()
-    small_run(tmp_path / "parts", episodes=2, twinning=FULL).train()
-    parts = small_run(tmp_path / "parts", episodes=4, resume=True, twinning=FULL).train()
-    *steps, total = parts["summary"]["seconds"].values()
-    assert sum(steps) < total
-    assert_same(whole, parts)
 
 
 def assert_same(whole, parts):
@@ -181,8 +160,14 @@ def with_all_parts(folder, episodes, **options):
 def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, monkeypatch):
     whole = with_all_parts(tmp_path / "whole", 3)
     started = [weight.clone() for weight in whole.algorithm.policies["model_free"].parameters()]
-    found = whole.train()
-    interrupted_in(1, monkeypatch)
+    found, plan = whole.train(), MakePlan.forward
+
+    def pressed(self, flowing):
+        if flowing["number"] == 1:
+            raise KeyboardInterrupt
+        return plan(self, flowing)
+
+    monkeypatch.setattr(MakePlan, "forward", pressed)
     interrupted = with_all_parts(tmp_path / "parts", 3)
     assert len(interrupted.train()["episodes"]) == 1
     monkeypatch.undo()
@@ -200,32 +185,11 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     assert torch.equal(whole.algorithm.generator.get_state(), resumed.algorithm.generator.get_state())
 
 
-def interrupted_in(episode, monkeypatch):
-    """Let Ctrl-C come in step 5 of an episode, counted from 0."""
-    plan = MakePlan.forward
-
-    def interrupted(self, flowing):
-        if flowing["number"] == episode:
-            raise KeyboardInterrupt
-        return plan(self, flowing)
-
-    monkeypatch.setattr(MakePlan, "forward", interrupted)
-
-
-def test_quick_is_a_small_run(tmp_path):
-    effective = RunConfig(quick=True, log_dir=tmp_path).effective()
-    assert (effective.episodes, effective.unseen, effective.twinning.learner.critic_iterations) == (3, 5, 200)
-    fewer = RunConfig(quick=True, episodes=2, unseen=3).effective()
-    assert (fewer.episodes, fewer.unseen) == (2, 3)
-
-
-def test_an_unwritable_folder_is_refused(tmp_path):
+def test_an_unwritable_folder_and_a_plant_that_breaks_its_contract_are_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="log_dir=.*cannot be made"):
         small_run(tmp_path / "file" / "run")
 
-
-def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
     class Forgetful(LinearQuadratic):
         def observe(self, t, state, exogenous):
             return state.detach()

@@ -6,11 +6,9 @@ import json
 import math
 import os
 import signal
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import study
 from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
@@ -120,9 +118,10 @@ def test_what_diverges_costs_infinitely(tmp_path):
     for merits in itertools.permutations((1.0, math.nan, 3.0)):  # in whatever order the folders are given
         row = Row(name="a", runs=[dataclasses.replace(run, merit={"power [W]": merit}) for merit in merits])
         assert math.isnan(row.numbers(row)["merit"]["power [W]"])
-    row = cells(Comparison("tanks", [Row(name="a", runs=[run], optimum=1.0)]).table())["a"]
+    comparison = Comparison("tanks", [Row(name="a", runs=[run], optimum=1.0)])
+    row = cells(comparison.table())["a"]
     assert row[2] == row[4] == row[5] == "inf" and row[6] == "2"  # near the optimum after the second episode
-    comparison_figure([Comparison("tanks", [Row(name="a", runs=[run])])], "t").canvas.draw()
+    comparison_figure([comparison], "t").canvas.draw()
 
 
 def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_path):
@@ -143,7 +142,6 @@ def test_runs_that_differ_in_the_seed_are_one_row_and_tasks_are_told_apart(tmp_p
     names = list(numbers["rows"])
     assert numbers["controllers"] == {f"PI ({names[0]})": 2.0, f"PI ({names[2]})": 6.0}
     assert numbers["rows"][names[1]]["J_a_ratio"]["ratio"] == 1.0 and numbers["rows"][names[2]]["J_a_ratio"] is None
-    assert len(comparison_figure([found], "t").axes) == 2
     for folders in ([first[0], seeing], [seeing, first[0]]):
         *_, heading, _, one, two, _ = compare_runs(folders).table().splitlines()
         assert "level outside [%]" in heading and sorted(row.split("|")[3].strip() for row in (one, two)) == ["", "3"]
@@ -159,14 +157,9 @@ def test_runs_that_cannot_be_compared_are_refused(tmp_path):
         other = leave(tmp_path / message[-9:], **{"seed": 0, "costs": [1.0, 2.0]} | options)
         with pytest.raises(ValueError, match=message):
             compare_runs([first, other])
-    (first / "metrics.json").write_text('{"episodes": [')
-    with pytest.raises(ValueError, match=r"metrics\.json is damaged"):
-        compare_runs([first])
     (first / "metrics.json").unlink()
     with pytest.raises(ValueError, match="has no metrics.json: it is not finished"):
         compare_runs([first])
-    with pytest.raises(ValueError, match="names no run"):
-        compare_runs([])
 
 
 def test_costs_on_different_twins_are_not_compared(tmp_path):
@@ -186,19 +179,6 @@ def test_costs_on_different_twins_are_not_compared(tmp_path):
     assert found.rows[0].costs == {0: 5.0, 1: 5.0} and found.numbers()["controllers"] == {"PI": 8.0}
     with pytest.raises(ValueError, match="differ in their place of the unseen episodes"):
         compare_runs([*folders, leave(tmp_path / "2", seed=2, costs=[1.0, 2.0])])
-
-
-def test_the_figure_has_medians_ranges_and_the_ends_of_its_panels(tmp_path):
-    runs = [
-        FinishedRun.read(leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 1.0], curve=curve))
-        for seed, curve in enumerate(((1e3, 1.0), (3.0, 1.5), (4.0, 2.0)))
-    ]
-    (ax,) = comparison_figure([Comparison("tanks", [Row(name="a", runs=runs, optimum=0.9)])], "t").axes
-    drawn = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in ax.lines}
-    assert drawn == {"a": [4.0, 1.5], "optimum": [0.9, 0.9], "PI": [2.0, 2.0]}
-    band = ax.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.max() == 1e3 and band.min() == 1.0
-    assert ax.get_title(loc="left") == "tanks: $J_a$"
 
 
 # The study itself.
@@ -224,10 +204,6 @@ def test_systems_and_arms_have_names(tmp_path):
     assert training.folder == tmp_path / "gusty" / "model_free" / "seed-0"
     config = training.config()
     assert (config.horizon, config.unseen, config.twinning.arm, config.unseen_every) == (2.0, 4, "model_free", 1)
-    small = study.Config(quick=True)
-    assert {key: len(group) for key, group in small.trainings().items()} == {
-        ("wind_turbine", arm): 2 for arm in ("twinning", "model_based", "model_free")
-    }
 
 
 def test_two_arms_and_two_seeds(tmp_path, capsys):
@@ -243,12 +219,10 @@ def test_two_arms_and_two_seeds(tmp_path, capsys):
     assert found["twinning"]["J_a"]["median"] == pytest.approx((finals["twinning", 0] + finals["twinning", 1]) / 2.0)
     plant = LinearQuadratic(horizon=2.0)
     best = found["twinning"]["optimum"]
-    unseen = UnseenEpisodes(plant, 3)
-
-    def cost(gain):
-        return unseen.control_costs(LinearGain(gain[None])).mean().item()
-
-    searched = minimize(cost, optimal_gain(1.0)[0], method="Nelder-Mead").fun
+    costs = UnseenEpisodes(plant, 3).control_costs
+    searched = minimize(
+        lambda gain: costs(LinearGain(gain[None])).mean().item(), optimal_gain(1.0)[0], method="Nelder-Mead"
+    ).fun
     assert best == pytest.approx(searched, rel=1e-5) and best <= min(finals.values())
     assert "| twinning | 2 |" in capsys.readouterr().out and (tmp_path / "study.png").stat().st_size > 5000
     (optimum,) = (tmp_path / "optima").iterdir()
@@ -261,12 +235,8 @@ def test_two_arms_and_two_seeds(tmp_path, capsys):
         study.main(config(tmp_path, given="--episodes 2", **arms))
     longer = json.loads((folders["twinning", 0] / "metrics.json").read_text())["episodes"]
     assert len(longer) == 2 and longer[0] == json.loads(written["twinning", 0])["episodes"][0]
-    for given, message in (
-        ("", "seed-0 holds a run of other options: episodes is 1 here and was 2 in the run"),
-        ("--episodes 2 --horizon 1.0", r"horizon is 1\.0 here and was 2\.0 in the run"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            study.main(config(tmp_path, given=given))
+    with pytest.raises(ValueError, match="seed-0 holds a run of other options: episodes is 1 here and was 2"):
+        study.main(config(tmp_path))
 
 
 def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatch):
@@ -289,20 +259,14 @@ def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatc
     assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]
 
 
-def broken_recipe(folder, statement):
-    """The tiny recipe with a statement before its run."""
-    file = folder / "broken.py"
-    file.write_text(TINY.read_text().replace("    Run(config", f"    {statement}\n    Run(config"))
-    return file
-
-
 def test_a_training_that_fails_stops_no_other(tmp_path, capsys):
-    broken = broken_recipe(tmp_path, "if config.seed:\n        1 / 0")
+    broken, failing = tmp_path / "broken.py", "    if config.seed:\n        1 / 0\n    Run(config"
+    broken.write_text(TINY.read_text().replace("    Run(config", failing))
     with pytest.raises(ValueError, match=r"1 failed, the others are kept:\n.*seed-1: ZeroDivisionError: division"):
         study.main(config(tmp_path / "study", systems=(f"tiny={broken}",), optimum=False))
     assert "| twinning | 1 |" in capsys.readouterr().out
     log = (tmp_path / "study" / "tiny" / "twinning" / "seed-1" / "training.log").read_text()
-    assert "Traceback" in log and "1 / 0" in log and "ZeroDivisionError" in log
+    assert "Traceback" in log and "1 / 0" in log
 
 
 def test_a_comparison_of_runs_does_not_take_the_place_of_a_study(tmp_path):
@@ -314,12 +278,6 @@ def test_a_comparison_of_runs_does_not_take_the_place_of_a_study(tmp_path):
     assert (tmp_path / "study" / "study.md").read_bytes() == kept
     for _ in range(2):  # a comparison takes the place of itself
         study.main(config(tmp_path / "compared", runs=(run,)))
-
-
-def test_ray_is_asked_for_by_name(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray.util.joblib", None)
-    with pytest.raises(ValueError, match=r"backend='ray' needs Ray: .*rt_torchrl\[cluster\]"):
-        study.studied(config(tmp_path, backend="ray"))
 
 
 @pytest.mark.slow
@@ -334,21 +292,12 @@ def test_a_cluster_of_ray(tmp_path):
 
 def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
     """Model predictive control may cost less than the optimum of the class."""
-    twinning = {name: ("--twinning.planner.method", name) for name in ("single_start", "receding_horizon")}
-    arms = {
-        "plan": (twinning["single_start"], 0.9, "model_based"),
-        "mpc": (twinning["receding_horizon"], 0.5, "model_based"),
-    }
     trainings, searches = {}, {}
-    for arm, (words, cost, live) in arms.items():
+    for arm, cost in (("single_start", 0.9), ("receding_horizon", 0.5)):
         folder = leave(tmp_path / arm, seed=0, costs=[cost, cost], arm=arm)
-        metrics = json.loads((folder / "metrics.json").read_text())
-        metrics["summary"]["live"], metrics["summary"]["unseen"]["costs"][live] = live, [cost, cost]
-        (folder / "metrics.json").write_text(json.dumps(metrics))
-        config = study.options_of(TINY, words)
-        trainings["tiny", arm] = [
-            SimpleNamespace(folder=folder, finished=lambda: True, config=lambda config=config: config)
-        ]
+        config = study.options_of(TINY, ("--twinning.planner.method", arm))
+        training = SimpleNamespace(folder=folder, finished=lambda: True, config=lambda config=config: config)
+        trainings["tiny", arm] = [training]
         searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
     (found,) = study.comparisons_of(trainings, searches)
     assert [row.optimum for row in found.rows] == [0.9] * 2

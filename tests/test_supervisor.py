@@ -1,18 +1,17 @@
 """Operating limits: held on the real side, predicted on the twin before a policy acts, and counted."""
 
 import dataclasses
+import functools
 
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
-from small_runs import SMALL
+from small_runs import SMALL, small_run
 from test_algorithm import flown as after
 from test_algorithm import twinning
 
-from rt_torchrl import ClassicalController, OperatingLimits, PlantEnv, Run, RunConfig, SafetyLayer, Trajectory
-from rt_torchrl.options import read_options
+from rt_torchrl import ClassicalController, OperatingLimits, PlantEnv, RunConfig, SafetyLayer, Trajectory
 from rt_torchrl.runs.real_side import simulated
-from rt_torchrl.runs.settings import as_written
 from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.switch import other_than
 from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
@@ -88,27 +87,18 @@ def test_without_a_policy_that_may_act_the_training_says_so():
     found.episode()
     with pytest.raises(ValueError, match="no policy may act. .*would leave the limits in .* --start controller"):
         found.episode()
+    with pytest.raises(ValueError, match="no safety layer that holds them"):
+        twinning(limits=LIMITS)
 
 
 def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
-    def run(folder, **options):
-        twinning = dataclasses.replace(SMALL, limits=WIDE)
-        shared = {"unseen": 2, "figures": False}
-        config = RunConfig(log_dir=folder, twinning=twinning, **shared, **options)
-        assert read_options(RunConfig, as_written(config) | {"log_dir": None, "resume": False}).twinning == twinning
-        return Run(config, LinearQuadratic(horizon=2.0))
-
+    run = functools.partial(small_run, twinning=dataclasses.replace(SMALL, limits=WIDE))
     whole = run(tmp_path / "whole", episodes=3).train()["episodes"]
     assert all("violations/states" in record for record in whole)
     assert [("predicted_violations" in record) for record in whole] == [False, True, True]
     run(tmp_path / "cut", episodes=2).train()
     resumed = run(tmp_path / "cut", episodes=3, resume=True).train()["episodes"]
     assert [{**record, "seconds": 0} for record in resumed] == [{**record, "seconds": 0} for record in whole]
-
-
-def test_limits_need_a_safety_layer():
-    with pytest.raises(ValueError, match="no safety layer that holds them"):
-        twinning(limits=LIMITS)
 
 
 class Lagged(ClassicalController):

@@ -157,24 +157,6 @@ def test_a_simulation_starts_where_its_first_samples_say():
     np.testing.assert_allclose(readings[:, 0].numpy(), start + slope * TIMES, atol=1e-6)
 
 
-class WindyLine(Line):
-    """The line with a wind that is drawn anew every second."""
-
-    def __init__(self):
-        super().__init__(horizon=4.0)
-
-    def draw_exogenous(self, batch, generator):
-        return torch.randn(batch, 4, 1, generator=generator, dtype=torch.float64).repeat_interleave(10, 1)
-
-
-def test_intervals_of_a_regression_hold_the_truth():
-    simulated, generator = (WindyLine(), Slope(), sensors_of(Line(), ["position"])), torch.Generator().manual_seed(0)
-    found = coverage(*simulated, lambda: recorded(*simulated, generator, share=0.1), simulations=20)
-    # Two times 20 intervals: 95 % within 3 · 3.4 %, and a mean square of 1 within 2 · √(2/40).
-    assert 0.85 <= found.mean <= 1.0 and found.told.tolist() == [1.0, 1.0]
-    assert 0.7 < found.error_over_bound.square().mean().sqrt() < 1.3
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["flapping_wing", "cryogenic_tank", "cascaded_tanks", "pendulum", "wind_turbine"])
 def test_intervals_hold_the_truth_on_each_plant(name):
