@@ -12,7 +12,7 @@ from rt_torchrl import DigitalTwin, ExtendedClosure, PlantEnv, ReinforcementTwin
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
-from rt_torchrl.runs.results import hypotheses_of, hypothesis_lines, twin_entries
+from rt_torchrl.runs.results import twin_entries
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (
@@ -78,7 +78,6 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
         for name in twin.twins:
             twin.weights = {name: 1.0}
             gradients[engine, name] = torch.autograd.grad(twin.cost(policy, *scenario), policy.gain)[0]
-    assert len(gradients) == 6
     for name, tolerance in {ALONE: 1e-3, "late": 1e-12, "lags": 1e-12}.items():
         torch.testing.assert_close(gradients["odeint_adjoint", name], gradients["native", name], rtol=tolerance, atol=0)
 
@@ -121,9 +120,7 @@ def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
     twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
     assert twin.weights == {"lags": 1.0} and twin.likeliest == "lags"
     assert twin.twins["lags"].closure.named_coefficients()["force_lag"].item() == pytest.approx(LAG, rel=1e-3)
-    torch.testing.assert_close(
-        twin.twins["lags"].closure.base.matrix, PLANT.closure.matrix, rtol=0.0, atol=2e-3, check_device=False
-    )
+    torch.testing.assert_close(twin.twins["lags"].closure.base.matrix, PLANT.closure.matrix, rtol=0.0, atol=2e-3)
     report = assimilation.report()
     assert report["hypothesis/lags"] == 1.0 and report["misfit/lags"] < 1e-3 * report[f"misfit/{ALONE}"]
     assert twin.hypothesis == "lags"
@@ -173,32 +170,14 @@ def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
 
 
 def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
-    twin, assimilation = ensemble(PLANT)
-    twin.weights = {ALONE: 1.0, "late": 3.0}
-    policy = LinearGain([[1.0, 1.0]])
-    episodes = drawn(PLANT, 4)
-
-    def parts():
-        each = [twin.twins[name] for name in (ALONE, "late")]
-        return [one.cost(policy, one.plant.at_rest(episodes[0]), episodes[1]) for one in each]
-
-    def slope(cost):
-        return torch.autograd.grad(cost, policy.gain)[0]
-
-    mean = 0.25 * parts()[0] + 0.75 * parts()[1]
-    torch.testing.assert_close(twin.cost(policy, *episodes), mean)
-    torch.testing.assert_close(slope(twin.cost(policy, *episodes)), slope(0.25 * parts()[0] + 0.75 * parts()[1]))
-    assert isinstance(assimilation, EnsembleAssimilation)
-
-
-def test_the_results_say_what_the_twin_lacks():
     twin, _ = ensemble(PLANT)
-    assert hypotheses_of(twin) == hypotheses_of(DigitalTwin(PLANT, PLANT.closure)) == {}
-    twin.weights = {ALONE: 0.1, "lags": 0.6, "late": 0.3}
-    found = hypotheses_of(twin)
-    assert found["late"] == {"weight": 0.3, "weights": {}, "described": {}}
-    lines = hypothesis_lines(found)
-    assert lines == ["  beside the twin: lags, weight 0.60, force_lag = 0.2 s", "  beside the twin: late, weight 0.30"]
+    twin.weights = {ALONE: 1.0, "late": 3.0}
+    policy, episodes = LinearGain([[1.0, 1.0]]), drawn(PLANT, 4)
+    parts = [twin.twins[name] for name in (ALONE, "late")]
+    alone, late = (one.cost(policy, one.plant.at_rest(episodes[0]), episodes[1]) for one in parts)
+    found, mean = twin.cost(policy, *episodes), 0.25 * alone + 0.75 * late
+    torch.testing.assert_close(found, mean)
+    torch.testing.assert_close(*(torch.autograd.grad(cost, policy.gain)[0] for cost in (found, mean)))
 
 
 def kept(misfits):

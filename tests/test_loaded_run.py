@@ -8,7 +8,6 @@ import sys
 
 import pytest
 import torch
-from figure_reading import draw
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 from test_classical import PD
@@ -145,7 +144,6 @@ def name_recipe(folder, file, name="Config"):
 def test_recipes_that_cannot_be_found_are_told(tmp_path):
     leave_run_of(tmp_path, Own(), LinearQuadratic())
     for name, file, message in (
-        ("make.<locals>.Config", settings_module.__file__, "defines no make.*If it has moved"),
         ("Config", None, "does not say in which file"),
         ("Config", "/gone.py", "/gone.py does not exist.*If it has moved"),
         ("Path", settings_module.__file__, "Path is no class derived from RunConf"),
@@ -279,15 +277,6 @@ def test_impossible_requests_are_refused(run):
     ):
         with pytest.raises(ValueError, match=message):
             run.simulate(policy, **arguments)
-    with pytest.raises(ValueError, match="figure 'state' does not exist in this run; choose one of "):
-        run.figure("state")
-
-
-def test_figures_show_the_episode_that_is_given(run):
-    flown = run.simulate(run.policy("model_based"), torch.full((30, 1), 12.5), seed=5)
-    drawn = {line.get_label(): line.get_ydata() for line in run.figure("states", flown).axes[0].lines}
-    assert drawn["real"] == pytest.approx(flown.states[:, 0].numpy()) and "twin" in drawn
-    assert {"states", "learning_curves", "power_and_speed"} <= set(run.figure_names())
 
 
 @pytest.mark.parametrize("plant", [Undisturbed(horizon=2.0), Falling()])
@@ -298,11 +287,5 @@ def test_figures_show_the_twin_of_a_plant_without_inputs_and_end_with_the_episod
     flown = loaded.simulate(LinearGain([[0.0, 0.0]]))
     ended = plant.ended(flown.states).tolist()
     drawn = {line.get_label(): line.get_ydata() for line in loaded.figure("states", flown).axes[0].lines}
-    assert drawn.keys() >= {"real", "twin"}
-    assert len(drawn["real"]) == (ended.index(True) + 1 if any(ended) else plant.n_steps + 1)
-
-
-def test_figures_call_a_flight_on_the_twin_so(run):
-    flown = run.simulate(run.policy("model_based"), torch.full((2, 30, 1), 12.5), on="twin")
-    found = draw(run.figure("states", flown))
-    assert "States, flight on the twin" in found and "real" not in found
+    last = ended.index(True) if any(ended) else plant.n_steps
+    assert "twin" in drawn and drawn["real"] == pytest.approx(flown.states[: last + 1, 0].numpy())

@@ -1,13 +1,10 @@
 """NaN, infinity and signed zeros in machine code, over every kind of lanes, as torch has them."""
 
 import math
-import threading
 
 import llvmlite.binding as llvm
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import nn
 from traced_function import Snippet, compared, gap, marched, signals
 
@@ -27,6 +24,8 @@ UNARY = {
     **{f: getattr(torch, f) for f in "exp log sin tanh sqrt abs floor round sign neg relu sigmoid isnan erf".split()},
     **{f: getattr(torch, f) for f in "log1p expm1 atan rsqrt reciprocal square trunc isinf isfinite erfc".split()},
     "zero times": lambda x: 0.0 * x,
+    "minus itself": lambda x: x - x,
+    "by itself": lambda x: x / x,
     "plus zero": lambda x: x + 0.0,
     "zero minus": lambda x: 0.0 - x,
     "minus zero": lambda x: x - 0.0,
@@ -51,19 +50,6 @@ BINARY = {
 BINARY |= {f: getattr(torch, f) for f in "gt lt ge le eq ne logaddexp".split()}
 
 
-def trees():
-    """Random expressions of two signals."""
-    leaf = st.sampled_from([lambda x, y: x, lambda x, y: y])
-
-    def grown(inner):
-        unary, binary = (st.sampled_from([held[name] for name in sorted(held)]) for held in (UNARY, BINARY))
-        one = st.builds(lambda f, a: lambda x, y: f(a(x, y)).double(), unary, inner)
-        two = st.builds(lambda f, a, b: lambda x, y: f(a(x, y), b(x, y)).double(), binary, inner, inner)
-        return one | two
-
-    return st.recursive(leaf, grown, max_leaves=4)
-
-
 def assert_same(f, lanes=None):
     """Equal values over all pairs of special numbers."""
     x, y = (v.flatten() for v in torch.meshgrid(SPECIAL, SPECIAL, indexing="ij"))
@@ -72,10 +58,8 @@ def assert_same(f, lanes=None):
     _, drive = signals(len(x), 1)
     state, lanes = torch.stack([x, y], -1), lanes or lanes_of_this_machine()
     n = lanes.number
-    usual = Point(
-        torch.linspace(0.3, 0.8, 2 * n).double().view(n, 2), Drive(drive.t[0].expand(n), *(z[0, :n] for z in drive[1:]))
-    )
-    programs = IntervalCode(snippet, usual, lanes)
+    first = Drive(drive.t[0].expand(n), *(z[0, :n] for z in drive[1:]))
+    programs = IntervalCode(snippet, Point(torch.linspace(0.3, 0.8, 2 * n).double().view(n, 2), first), lanes)
     with torch.no_grad():
         task = native._Task(programs, Inputs(snippet), state, drive)
         found = native._EndStates.apply(task, state, *drive, *task.inputs.learned)[0, :, 0]
@@ -94,18 +78,11 @@ def test_special_values_of_whole_quotients():
     assert_same(lambda x, y: torch.div(x, 0.1, rounding_mode="floor"))
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(trees())
-def test_special_values_of_expressions(tree):
-    assert_same(tree)
-
-
 def all_functions(m, s, d):
     x = m.net(s).tanh() + 0.3
     y = x.exp().log1p() + x.sin() * x.cos() + x.abs().pow(1.3) + torch.atan2(x, s[..., :1]) + x.erf()
-    return (y + torch.hypot(x, y) + torch.remainder(x, 0.7) + x.clamp(-0.5, 0.5))[..., :3] * m.w0 + x.sum(
-        -1, keepdim=True
-    )
+    y = y + torch.hypot(x, y) + torch.remainder(x, 0.7) + x.clamp(-0.5, 0.5)
+    return y[..., :3] * m.w0 + x.sum(-1, keepdim=True)
 
 
 @pytest.mark.parametrize("width", [3, 40])
@@ -138,16 +115,6 @@ def test_the_text_compiles_for_other_processors():
 
 
 # Groups of lanes: their work is shared among threads, once each, and a failure of any of them is raised
-
-
-def test_groups_run_at_the_same_time():
-    torch_threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        meeting = threading.Barrier(2, timeout=20.0)  # which one thread alone would wait for in vain
-        for_each_group(2, 1, lambda group: meeting.wait() and None)
-    finally:
-        torch.set_num_threads(torch_threads)
 
 
 @pytest.mark.parametrize("failing", [0, 16])

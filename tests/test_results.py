@@ -20,13 +20,6 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.metrics import read_metrics
-from rt_torchrl.runs.results import (
-    alarm_lines,
-    closure_lines,
-    cost_of_learning,
-    fit_lines,
-    next_steps,
-)
 from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
 
@@ -72,21 +65,18 @@ def cheapest(policies, episodes):
 ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
 
 
-@pytest.mark.parametrize(
-    ("known", "errors", "columns", "rows"),
-    [
-        ({"true": {"other": 1.0}}, None, "", ["a 1 1.5", "b 2 2.5"]),
-        ({"true": {"a": 1.25}}, {"a": 0.25, "b": None}, " std. error true", ["a 1 1.5 0.25 1.25", "b 2 2.5 - -"]),
-        ({}, {"a": 0.0, "b": 0.5}, " std. error", ["a 1 1.5 fixed", "b 2 2.5 0.5"]),
-        ({"described": ROD}, None, "", ["a [kg] 1 1.5 mass of the rod", "b 2 2.5"]),
-    ],
-)
-def test_weights_are_shown_with_what_is_known_of_them(known, errors, columns, rows):
-    closure = {"start": {"a": 1.0, "b": 2.0}, "found": {"a": 1.5, "b": 2.5}, "described": {}} | known
-    shown = [" ".join(line.split()) for line in closure_lines(closure, errors=errors)]
-    legend = "std. error -: the records say nothing of the weight alone, at most of combinations with others"
-    unknown = errors is not None and None in errors.values()
-    assert shown == [f"closure weight start found{columns}", *rows, *[legend][: int(unknown)]]
+def test_weights_are_shown_with_what_is_known_of_them():
+    names = ("a", "b", "c")
+    start, found = dict(zip(names, (1.0, 2.0, 3.0), strict=True)), dict(zip(names, (1.5, 2.5, 3.0), strict=True))
+    closure = {"start": start, "found": found, "described": ROD, "true": {"a": 1.25}}
+    lines = results.closure_lines(closure, errors={"a": 0.25, "b": None, "c": 0.0})
+    assert [" ".join(line.split()) for line in lines] == [
+        "closure weight start found std. error true",
+        "a [kg] 1 1.5 0.25 1.25 mass of the rod",
+        "b 2 2.5 - -",
+        "c 3 3 fixed -",
+        "std. error -: the records say nothing of the weight alone, at most of combinations with others",
+    ]
 
 
 # The bar of a training says what is under way.
@@ -177,10 +167,11 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": {"J_a": {"mean": controller}}}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
-        return next_steps({"summary": found}, tmp_path, config)
+        return results.next_steps({"summary": found}, tmp_path, config)
 
-    other, first = {"model_based": "model_free", "model_free": "model_based"}[live], {"expected": 3.0, "paid": 2.0}
+    first = {"expected": 3.0, "paid": 2.0}
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
+    other = "model_free" if live == "model_based" else "model_based"
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
     told = said(live, 2.0 * cost, place="twin", first=first)
     assert "the controller that flew first is better than the live policy" in told
@@ -195,15 +186,15 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     rms, line = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None}, "RMS rotor_speed 0.0123 rad/s, shares diverges"
     for segment, where in ((0, "its last records"), (22, "segments of 22 intervals")):
         found = {"rms": rms, "segment": segment, "standard_errors": {}}
-        assert fit_lines(found) == [f"  twin over {where}: {line}"]
+        assert results.fit_lines(found) == [f"  twin over {where}: {line}"]
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"} | {f"rms/{name}": rms[name] for name in rms}
     assert progress_line(record) == f"{line}, real 0.5, live model-free"
 
 
 def test_every_window_is_paid_and_episodes_are_counted_from_one():
     episodes = [{"episode": 1, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 2, "real_cost": 1.0}]
-    assert cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
-    lines = alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
+    assert results.cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
+    lines = results.alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
     assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]
 
 

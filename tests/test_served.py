@@ -25,16 +25,7 @@ from served_turbine import ServedPlant, machine
 from tensordict import TensorDict
 from test_export_recipe import recipe
 
-from rt_torchrl import (
-    ConnectedPlant,
-    ExplorationConfig,
-    LinkLostError,
-    ModbusLink,
-    OperationConfig,
-    PlantEnv,
-    Rollout,
-    Run,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.systems.operation import Operation, Operator
 
@@ -52,7 +43,7 @@ def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples(
         states.append([plant.published()[f"state.{state.name}"] for state in PLANT.states])
         plant.advance([command], float(k + 1))
     start, inputs = drawn(PLANT, 1, 3)
-    expected = Rollout(PLANT, PLANT.closure)(start, inputs, asked[None, :, None])
+    expected = rt.Rollout(PLANT, PLANT.closure)(start, inputs, asked[None, :, None])
     torch.testing.assert_close(torch.tensor(states).double(), expected.states[0, :-1].detach())
     assert plant.sample == PLANT.n_steps + 1 and not torch.equal(plant._inputs, inputs)
 
@@ -81,7 +72,7 @@ class Line:
         while self.plant.sample * self.period <= self.time.now + 1e-12:
             self.plant.advance([self.answer["command.force"]], self.answer["answered"])
         if any(begin <= self.time.now < end for begin, end in self.down):
-            raise LinkLostError("down")
+            raise rt.LinkLostError("down")
 
     def connect(self):
         self._up("connect")
@@ -100,7 +91,7 @@ class Line:
 
 def connected(line, entries=ENTRIES, **options):
     times = {"period": line.period, "clock": line.time, "sleep": line.time.sleep}
-    return ConnectedPlant(
+    return rt.ConnectedPlant(
         line, entries, COMMANDS, PLANT.actions, **times, sample="sample", answered="answered", **options
     )
 
@@ -266,8 +257,8 @@ def test_the_example_makes_a_real_system_that_connects_at_its_reset():
     exec(modbus, names)
     exec(code.replace("opc.tcp://rig:4840", f"opc.tcp://127.0.0.1:{free_port()}"), names)  # nobody listens there
     system = names["machine"]()
-    assert isinstance(names["link"], ModbusLink) and system.pace.period == system.plant.dt == 0.05
-    with pytest.raises(LinkLostError):
+    assert isinstance(names["link"], rt.ModbusLink) and system.pace.period == system.plant.dt == 0.05
+    with pytest.raises(rt.LinkLostError):
         system.env.env.link.read()
     system.env.env.link.close()
 
@@ -304,12 +295,12 @@ def lose(relay, ended, lost):
 def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path):
     pytest.importorskip("pymodbus")
     log, config = tmp_path / "safety.jsonl", served_turbine.Config().defaults()
-    operation = {"asynchronous": True, "operation": OperationConfig(continuous=True)}
+    operation = {"asynchronous": True, "operation": rt.OperationConfig(continuous=True)}
     config = dataclasses.replace(config, horizon=60.0, threads=1, log_dir=tmp_path / "run", **operation)
     plant, period, ended, lost, used = config.plant(), config.dt / PACE, threading.Event(), [], []
     with served_turbine_alone(pace=PACE, horizon=60.0) as port, contextlib.closing(Relay(port)) as relay:
         env = partial(machine, plant, served_turbine.SAFE, "modbus", relay.port, period, log=log)
-        run = Run(config, plant, env=env, first=JonkmanController)
+        run = rt.Run(config, plant, env=env, first=JonkmanController)
         algorithm, until = run.algorithm, float("inf")
         losing = threading.Thread(target=lose, args=(relay, ended, lost), daemon=True)
         try:
@@ -353,10 +344,10 @@ def test_the_period_is_kept_beside_learning_as_without(tmp_path):
     """Steps 2 to 6 of a training whose real episode is over are taken again and again."""
     config = dataclasses.replace(recipe("wind_turbine").Config().defaults(), horizon=25.0, log_dir=tmp_path)
     plant, period = config.plant(), 0.02
-    run = Run(config, plant, first=JonkmanController)
+    run = rt.Run(config, plant, first=JonkmanController)
     episode, policy = run.algorithm(TensorDict({"number": 0})), run.algorithm.policies["model_free"]
-    make_env, options = partial(PlantEnv, plant, seed=1), OperationConfig(speed=plant.dt / period)
-    acting = Operator(make_env, plant, {"model_free": policy}, ExplorationConfig(episodes=0), options, seed=0)
+    make_env, options = partial(rt.PlantEnv, plant, seed=1), rt.OperationConfig(speed=plant.dt / period)
+    acting = Operator(make_env, plant, {"model_free": policy}, rt.ExplorationConfig(episodes=0), options, seed=0)
     operation = Operation(acting, make_env())
 
     def learn():

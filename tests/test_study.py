@@ -99,17 +99,11 @@ def test_the_table_shows_these_numbers(tmp_path):
     assert both["geometric mean (systems)"][1] == f"{math.exp(0.1):.3f} (2)"
 
 
-@pytest.mark.parametrize(
-    ("costs", "others", "expected"),
-    [
-        ({0: 2.0, 5: 7.0}, {0: 1.0, 1: 9.0}, {"ratio": 2.0, "low": None, "high": None}),  # one common seed
-        ({0: 2.0}, {1: 1.0}, None),
-        ({0: -2.0, 1: 1.0}, {0: 1.0, 1: 1.0}, None),
-        ({0: math.inf, 1: 1.0}, {0: 1.0, 1: 1.0}, None),
-    ],
-)
-def test_ratios_are_those_of_common_seeds_with_positive_costs(costs, others, expected):
-    assert paired_ratio(costs, others) == (expected and {key: pytest.approx(expected[key]) for key in expected})
+def test_ratios_are_those_of_common_seeds_with_positive_costs():
+    others = {0: 1.0, 1: 9.0}
+    assert paired_ratio({0: 2.0, 5: 7.0}, others) == {"ratio": pytest.approx(2.0), "low": None, "high": None}
+    for costs in ({5: 2.0}, {0: -2.0, 1: 1.0}, {0: math.inf, 1: 1.0}):
+        assert paired_ratio(costs, others) is None
 
 
 def test_what_diverges_costs_infinitely(tmp_path):
