@@ -107,7 +107,7 @@ def test_an_fmu_has_every_function_of_the_standard(turbine, tmp_path):
 
 
 SLAVE = """
-from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
 
 class Barrel(Fmi2Slave):
     def __init__(self, **options):
@@ -116,9 +116,6 @@ class Barrel(Fmi2Slave):
         for name in "uv":
             self.register_variable(Real(name, causality=Fmi2Causality.input))
         self.register_variable(Real("h", causality=Fmi2Causality.output))
-        self.taps = 3
-        kind = {"causality": Fmi2Causality.input, "variability": Fmi2Variability.discrete}
-        self.register_variable(Integer("taps", **kind))
 
     def do_step(self, t, dt):
         if self.u > 40000.0:
@@ -134,8 +131,6 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
 
     (tmp_path / "barrel.py").write_text(SLAVE)
     path = Path(FmuBuilder.build_FMU(tmp_path / "barrel.py", dest=tmp_path))
-    with pytest.raises(ValueError, match=r"actions \['taps'\] are no variables of type Real in Barrel.fmu"):
-        environment(path, actions=["u", "taps"], outputs=["h"], exogenous=[])
     made = environment(path, actions=["u", "v"], outputs=["h"], exogenous=[])
     entries, level = made.reset(), 1.0
     assert entries["outputs"].tolist() == [1.0]

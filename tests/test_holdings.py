@@ -28,9 +28,9 @@ class Inner(nn.Module):
         super().__init__()
         self.linear, self.activation, self.scale = nn.Linear(2, 2).double(), torch.tanh, 2.0
         self.register_buffer("offset", torch.zeros(2, dtype=torch.float64))
-        self.names, self.inner, self.shift = ["a"], {"k": (1, 2)}, lambda x: x + 1.0
+        self.shift = lambda x: x + 1.0
         self.plain, self.zeros = torch.ones(2, 3, dtype=torch.float64).t(), torch.zeros(1, dtype=torch.float64)
-        self.part, self.array, self.kinds, self.pair = Plain(), np.ones(3), {"a", "b"}, (Plain(), 1.0)
+        self.part, self.kinds, self.pair = Plain(), {"a", "b"}, (Plain(), 1.0)
         self.least = functools.partial(max, 1)
 
     def forward(self, x):
@@ -44,14 +44,11 @@ def setting(name, value):
 CHANGES = {
     "a number": setting("scale", 3.0),
     "an integer in place of a float": setting("scale", 2),
-    "an element of a list": lambda m: m.names.append("b"),
-    "an element of a dictionary": lambda m: m.inner.update(k=(1, 3)),
     "a plain tensor, behind torch's back": lambda m: m.plain.data.add_(1e-12),
     "the memory of a plain tensor": lambda m: m.plain.numpy().__setitem__((1, 1), 2.0),
     "the strides of a tensor": lambda m: m.plain.t_(),
     "the sign of a zero": lambda m: m.zeros.neg_(),
     "the dtype of a buffer": lambda m: setattr(m, "offset", m.offset.float()),
-    "an array": lambda m: m.array.__setitem__(1, 2.0),
     "a set": lambda m: m.kinds.add("c"),
     "a list of an object": lambda m: m.part.table[1].append(3.0),
     "an object in a pair": lambda m: setattr(m.pair[0], "gain", 3.0),

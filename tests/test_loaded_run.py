@@ -9,6 +9,7 @@ import sys
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import drawn
 from small_runs import SMALL, small_run
 from test_classical import PD
 from test_documentation import leave_finished_run
@@ -24,6 +25,7 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.steps import interact
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.imitation import clones
 from rt_torchrl.systems.sound_part import SoundPart, sound_part
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
@@ -49,14 +51,8 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
     assert run.config == config and set(run.policies) == {"model_based", "model_free"} and run.plant.horizon == 3000.0
     for role, part in parts.items():
         found = run.closure if role == "closure" else run.policy(role)
-        assert type(found) is type(part)
-        require_same_weights(found, part)
+        assert clones(found, part)
     assert isinstance(run.policy("model_free"), SaturatedMLP) >= (policy == "mlp")
-
-
-def require_same_weights(found, expected):
-    its, ours = found.state_dict(), expected.state_dict()
-    assert its.keys() == ours.keys() and all(torch.equal(its[key], value) for key, value in ours.items())
 
 
 CHOICES = {
@@ -217,19 +213,15 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     run.train()
     trained = run.algorithm.twin
     loaded = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0))
-    for role, policy in run.algorithm.policies.items():
-        require_same_weights(loaded.policy(role), policy)
+    assert all(clones(loaded.policy(role), policy) for role, policy in run.algorithm.policies.items())
     found = loaded.twin
     assert isinstance(found, TwinEnsemble) and found.weights == trained.weights
     assert found.twins.keys() == trained.twins.keys() == {ALONE, "late", "lags"}
-    drawn = torch.Generator().manual_seed(0)
-    episodes = trained.plant.draw_initial_state(2, drawn), trained.plant.draw_exogenous(2, drawn)
     for twin in (found, trained):
         twin.weights = {ALONE: 0.5, "late": 0.5}
     policy = run.algorithm.policies["model_based"]
-    assert found.cost(policy, *episodes) == trained.cost(policy, *episodes)
-    for name, twin in trained.twins.items():
-        require_same_weights(found.twins[name].closure, twin.closure)
+    assert found.cost(policy, *drawn(trained.plant, 2)) == trained.cost(policy, *drawn(trained.plant, 2))
+    assert all(clones(found.twins[name].closure, twin.closure) for name, twin in trained.twins.items())
     with pytest.raises(
         ValueError, match=r"hypotheses in .*weights.pt do not fit: plant 'linear_quadratic' suspects no"
     ):

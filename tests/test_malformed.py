@@ -7,6 +7,7 @@ import struct
 import warnings
 import zipfile
 from functools import cache, partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -47,9 +48,8 @@ def read_sensor_log(path):
 
 
 def write_wind_text(path):
-    rows = [
-        f"{0.5 * k:8.3f}{8.0 + 0.1 * k:8.2f}{0.0:8.2f}{0.1:8.2f}{0:8.3f}{0.2:8.3f}{0:8.3f}{0:8.2f}" for k in range(20)
-    ]
+    rest = f"{0.0:8.2f}{0.1:8.2f}{0:8.3f}{0.2:8.3f}{0:8.3f}{0:8.2f}"
+    rows = [f"{0.5 * k:8.3f}{8.0 + 0.1 * k:8.2f}{rest}" for k in range(20)]
     path.write_text("! wind\n" + "\n".join(rows) + "\n")
 
 
@@ -78,11 +78,8 @@ def read_table(path):
 
 @cache
 def weights():
-    generator = torch.Generator().manual_seed(0)
-    return {
-        "policy": {"gain": torch.randn(3, 5, generator=generator, dtype=torch.float64)},
-        "names": ["a", None, True, 0.5],
-    }
+    gain = torch.randn(3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return {"policy": {"gain": gain}, "names": ["a", None, True, 0.5]}
 
 
 def read_weights(path):
@@ -95,18 +92,12 @@ def content():
     return {"format": run_folder.FORMAT, "episodes": [{"episode": 0}], "state": {"plant": "p", "algorithm": weights()}}
 
 
-class Holder:
-    """What takes a checkpoint's state, as an algorithm does."""
-
-    class twin:
-        plant = type("Named", (), {"name": "p"})
-
-    def load_state_dict(self, state):
-        assert torch.equal(state["policy"]["gain"], weights()["policy"]["gain"])
-
-
 def read_checkpoint(path):
-    assert run_folder.load_checkpoint(path.parent, Holder()) == [{"episode": 0}]
+    algorithm = Mock()  # which takes a checkpoint's state
+    algorithm.twin.plant.name = "p"
+    assert run_folder.load_checkpoint(path.parent, algorithm) == [{"episode": 0}]
+    (state,) = algorithm.load_state_dict.call_args.args
+    assert torch.equal(state["policy"]["gain"], weights()["policy"]["gain"])
 
 
 def read_config(path):

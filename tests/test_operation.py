@@ -343,7 +343,7 @@ def test_what_cannot_operate_is_refused(tmp_path):
 
 
 def test_the_first_controller_goes_on_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):
-    monkeypatch.setattr(Imitation, "imitate", lambda self, teacher, pupil, **data: 1.0)
+    monkeypatch.setattr(Imitation, "imitate", lambda *given, **data: 1.0)
     plant = LinearQuadratic(horizon=2.0)
     controller, planner = PD(plant, (0.4, 0.3)), rt.PlannerConfig(iterations=0, starts=0)
 

@@ -13,7 +13,7 @@ from test_export_recipe import RECIPES, recipe
 from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.config import ROLES
-from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.imitation import Imitation, clones
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
@@ -44,8 +44,8 @@ def test_it_acts_the_twin_is_fitted_and_the_other_half_learns(tmp_path, rule):
         assert record["J_a_plan"] == record["J_a_plan_before"] and record["plan_accepted"] == 1.0
         assert ("solve_median" in record) == (record["live"] == "model_based") and "critic_loss" in record
     assert len(run.algorithm.learner.memory) == 4 * 20
-    found = run.algorithm.twin.closure.matrix - run.algorithm.twin.plant.closure.matrix
-    assert found.norm() < 0.5 * (run.initial_closure.matrix - run.algorithm.twin.plant.closure.matrix).norm()
+    true = run.algorithm.twin.plant.closure.matrix
+    assert torch.dist(run.algorithm.twin.closure.matrix, true) < 0.5 * torch.dist(run.initial_closure.matrix, true)
 
 
 def test_in_the_arm_of_the_model_it_acts_from_the_first_episode_and_plans_on_the_twins_closure(tmp_path):
@@ -90,9 +90,7 @@ def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path, monkeypatch)
     loaded = load_run(tmp_path, Config)
     controller = loaded.policy("model_based")
     assert isinstance(controller, PredictiveControl) and controller.closure is loaded.closure
-    own = run.algorithm.policies["model_based"]
-    assert controller.state_dict().keys() == own.state_dict().keys()
-    assert all(torch.equal(value, own.state_dict()[name]) for name, value in controller.state_dict().items())
+    assert clones(controller, run.algorithm.policies["model_based"])
     export = recipe("export")
     monkeypatch.setattr(export.rt, "load_run", lambda folder, _: load_run(folder, Config))
     for what in ("policy", "controller"):

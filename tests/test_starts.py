@@ -42,14 +42,6 @@ class Config(RunConfig):
         return LinearClosure(torch.zeros(1, 2, 2)) if self.closure == "mlp" else super().make_closure(plant, generator)
 
 
-class OtherObservations(LinearQuadratic):
-    observations = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
-
-
-class OtherPlant(LinearQuadratic):
-    name = "another_plant"
-
-
 def training(folder, plant=None, episodes=2, twinning=TWINNING, **options):
     options = {"unseen": 2, "twinning": twinning} | options
     return small_run(folder, episodes, plant or Config().plant(), config=Config, parts={"first": PD}, **options)
@@ -122,11 +114,13 @@ def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believ
 
 
 def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
-    for plant, options, message in (
-        (OtherPlant(horizon=2.0), {}, "is a run of plant 'linear_quadratic', this run is of plant 'another_plant'"),
-        (OtherObservations(horizon=2.0), {}, "whose observations are .*velocity_error"),
-        (None, {"closure": "mlp"}, r"does not fit the LinearClosure of this run"),
+    speed = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
+    for changed, options, message in (
+        ({"name": "other"}, {}, "is a run of plant 'linear_quadratic', this run is of plant 'other'"),
+        ({"observations": speed}, {}, "whose observations are .*velocity_error"),
+        ({}, {"closure": "mlp"}, r"does not fit the LinearClosure of this run"),
     ):
+        plant = type("Other", (LinearQuadratic,), changed)(horizon=2.0, noise=0.1)
         with pytest.raises(ValueError, match=message):
             training(tmp_path / "new", plant, start=str(earlier), **options)
         assert not (tmp_path / "new").exists()

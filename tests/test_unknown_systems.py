@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from seeds_and_numbers import drawn, seeded
 from test_export_recipe import RECIPES, leave_run
 
 from rt_torchrl import Rollout, check_plant, load_run
@@ -49,7 +50,7 @@ def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     base = WindTurbine(inertia=1e15, observe=("scheduled",))
     plant = LaggedInflow(base, 10.0)
     check_plant(LaggedInflow(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
-    read, n, wind = base.draw_initial_state(1, torch.Generator().manual_seed(0)), 60, 13.0
+    read, n, wind = base.draw_initial_state(1, seeded()), 60, 13.0
     state, exogenous = plant.at_rest(read), torch.full((1, n, 1), wind, dtype=torch.float64)
     power = 1e6 * flown(plant, state, exogenous, read[:, None, 4:6].expand(1, n, 2))[0, :, -1]
     steady = read[:, 0] * base.aerodynamic_torque(read[:, 0], read[:, 5], torch.tensor([wind]).double(), base.closure)
@@ -62,9 +63,8 @@ def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
 def test_a_rotor_turns_in_the_wind_and_its_filter_in_what_the_anemometer_reads():
     base = WindTurbine()
     plant = MisreadWind(base, 0.9)
-    generators = [torch.Generator().manual_seed(2) for _ in range(2)]
-    state, true = plant.draw_initial_state(2, generators[0]), base.draw_initial_state(2, generators[1])
-    read, wind = plant.draw_exogenous(2, generators[0])[:, :40], base.draw_exogenous(2, generators[1])[:, :40]
+    (state, read), (true, wind) = drawn(plant, 2, 2), drawn(base, 2, 2)
+    read, wind = read[:, :40], wind[:, :40]
     torch.testing.assert_close(read, 0.9 * wind)
     command = true[:, None, 4:6].expand(2, 40, 2)
     found, expected = flown(plant, state, read, command), flown(base, true, wind, command)
