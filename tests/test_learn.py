@@ -392,3 +392,13 @@ def test_eviction_goes_by_the_present_priorities():
     assert labels(found)[:4] == [2.0, 3.0, 4.0, 5.0] and 8.0 in labels(found) and len(found) == 6
     drawn = found.sample(2000)["label"]
     assert {2.0, 3.0, 4.0, 5.0, 8.0} <= set(drawn.tolist()) and drawn.mode().values == 8.0
+
+
+def test_a_critic_that_has_diverged_is_told_before_the_memory_takes_its_errors():
+    found, episode = learner(return_steps=1), explored(4)
+    with torch.no_grad():
+        for weight in found.critic_adam.weights:
+            weight.fill_(torch.nan)
+    with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
+        found.store(episode)
+    assert not len(found.memory)

@@ -95,10 +95,13 @@ def test_it_plans_on_the_closure_as_it_is_trained():
     closure = LinearClosure(torch.tensor([[0.0, 0.0], [6.0, 0.0]]))
     controller, (state, exogenous) = control(closure=closure), drawn(PLANT, 4, 1)
     wrong, kept = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean(), copy.deepcopy(controller)
+    before = controller.act(0.0, state[:1], exogenous[:1, 0])
     with torch.no_grad():
         closure.matrix.copy_(PLANT.closure.matrix)
     right = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean()
     assert right < 0.95 * wrong
+    controller.begin()
+    assert not torch.allclose(controller.act(0.0, state[:1], exogenous[:1, 0]), before, atol=1e-2)
     torch.testing.assert_close(control_cost(PLANT, kept.fly(state, exogenous, PLANT.closure)).mean(), wrong)
     assert {name for name, _ in controller.named_parameters()} == {"closure.matrix"}
 

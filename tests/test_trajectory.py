@@ -3,6 +3,7 @@
 import copy
 import math
 import re
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -347,6 +348,24 @@ def test_a_step_never_raises_the_cost_and_the_valley_is_followed():
         assert found.best <= min(found.start, last)
         last = found.best
     torch.testing.assert_close(module.w.detach(), torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-6)
+
+
+def test_a_trial_that_diverges_is_taken_back():
+    module = valley(-1.2, 1.0)
+    equations = mock.Mock(side_effect=[module.equations(), *[FloatingPointError] * 3])
+    optimiser = LevenbergMarquardt(module, damping=1.0)
+    optimiser.run(equations, 3)
+    assert module.w.tolist() == [-1.2, 1.0]
+    assert optimiser.damping == pytest.approx(2.0 * 4.0 * 8.0)
+
+
+def test_a_cost_that_the_weights_cannot_lower_ends_the_run():
+    module = valley(1.0, 1.0)
+    cost, gradient, matrix = module.equations()
+    # What noise leaves of the cost at its minimum, and a gradient that is rounding beside it.
+    equations = mock.Mock(return_value=NormalEquations(cost + 1.0, gradient + 1e-9, matrix))
+    found = LevenbergMarquardt(module).run(equations, 15)
+    assert (equations.call_count, found.iterations, found.best) == (1, 0, 1.0)
 
 
 def test_a_weight_that_is_hardly_known_does_not_hold_up_the_others():

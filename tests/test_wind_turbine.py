@@ -56,6 +56,15 @@ def fly(plant, state, u, command):
         return Rollout(plant, plant.closure)(state, wind, held).states[0]
 
 
+def test_time_constant_of_the_drivetrain(c_p):
+    with torch.no_grad():
+        found = WindTurbine().time_constant(11.4)
+    h = 1e-5
+    slope = (torque(c_p, OMEGA_RATED + h, 0.0, 11.4) - torque(c_p, OMEGA_RATED - h, 0.0, 11.4)) / (2 * h)
+    # Central difference of a spline: h² of its curvature, and rounding 1e-16/1e-5.
+    assert found == pytest.approx(-J / slope, rel=1e-6)
+
+
 @pytest.mark.parametrize("u, beta, tau_g", [(12.0, 5.0, 30e3), (15.0, 11.0, 40e3)])
 def test_settles_where_the_torques_balance(c_p, u, beta, tau_g):
     root = brentq(lambda omega: torque(c_p, omega, beta, u) - N_G * tau_g, 0.9, 2.0, xtol=1e-12)
