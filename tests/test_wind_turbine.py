@@ -11,6 +11,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded
 
+from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine import plant as module
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
@@ -152,6 +153,26 @@ def test_filters_are_the_exponential_recursion_for_held_inputs():
         # h = 0.126: h⁵/120 = 2.6e-7 per step of differences up to 6 m/s and 36 rad/s, summed over 1/(1 − α) = 8 steps.
         assert states[k + 1, 2] == pytest.approx(u_hat, abs=1.3e-5)
         assert states[k + 1, 1] == pytest.approx(omega_hat, abs=8e-5)
+
+
+def test_no_command_breaks_the_simulation():
+    """1000 held commands over a whole episode: braked to standstill, stalled or racing, all stay finite."""
+    plant, generator, count = WindTurbine(), seeded(), 1000
+    state, wind = plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+    held = random_commands(plant, (count, 1), generator).expand(-1, plant.n_steps, -1)
+    with torch.no_grad():
+        states = Rollout(plant, plant.closure)(state, wind, held).states
+    assert states.isfinite().all()
+    omega = states[..., 0]
+    # Both ends have been visited: slower than a fifth of rated (cut-in of the generator), and overspeed.
+    assert (omega.amin(1) < 0.2 * OMEGA_RATED).sum() > 20 and (omega.amax(1) > 1.2 * OMEGA_RATED).sum() > 20
+    assert omega.min() >= 0
+    # Beyond the λ where C_p is negative at every pitch, wind and generator both brake: no rotor gets there in its
+    # strongest wind, whatever is commanded.
+    lam, beta = torch.arange(10.0, 20.0, 0.01).double(), torch.arange(0.0, 30.1, 0.5).double()
+    drives = (plant.closure(torch.cartesian_prod(lam, beta)).reshape(len(lam), -1) > 0).any(1)
+    runaway = lam[drives].max() + 0.01
+    assert (omega.amax(1) <= runaway * wind[..., 0].amax(1) / R).all()
 
 
 @pytest.mark.parametrize("name, rms", [("Dai2016", 0.091), ("BestFitToROSCOTable", 0.0116)])
