@@ -402,3 +402,16 @@ def test_a_critic_that_has_diverged_is_told_before_the_memory_takes_its_errors()
     with pytest.raises(ValueError, match="TD errors .* not finite .* critic has diverged"):
         found.store(episode)
     assert not len(found.memory)
+
+
+def test_state_round_trip_samples_the_same():
+    first, second = memory(seed=1), memory(seed=1)
+    first.store(labelled(list(range(8))), ERRORS)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    assert len(second) == 8
+    assert torch.equal(first.sample(100)["label"], second.sample(100)["label"])
+    for each in (first, second):
+        each.refresh(torch.tensor([0]), torch.tensor([7.0]))
+        each.store(labelled([10.0, 11.0, 12.0]), torch.ones(3))
+    # Label 1 had the least error once 0 was refreshed: it is evicted from both.
+    assert labels(first) == labels(second) and 1.0 not in labels(second) and 0.0 in labels(second)
