@@ -75,9 +75,9 @@ def explored(count, seed=0, spread=1.5):
     return transitions(states[:, :-1], action, reward, states[:, 1:]).reshape(-1)
 
 
-def transitions(observation, action, reward, following, done=False):
-    flag = torch.full(reward.shape, done)
-    next_ = {"observation": following, "reward": reward, "done": flag, "terminated": torch.zeros_like(flag)}
+def transitions(observation, action, reward, following):
+    done, terminated = (torch.zeros(reward.shape, dtype=torch.bool) for _ in range(2))
+    next_ = {"observation": following, "reward": reward, "done": done, "terminated": terminated}
     return TensorDict({"observation": observation, "action": action, "next": next_}, batch_size=reward.shape[:-1])
 
 
@@ -149,9 +149,8 @@ def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, ret
             traced.load_state_dict(start), eager.load_state_dict(start)
         for name in ("loss", "critic_adam", "actor_adam"):
             assert_equal(getattr(traced, name).state_dict(), getattr(eager, name).state_dict())
-    assert not torch.equal(
-        traced.policy.state_dict()[next(iter(traced.policy.state_dict()))], next(iter(POLICIES[policy]().parameters()))
-    )
+    learned, before = (next(iter(policy.parameters())) for policy in (traced.policy, POLICIES[policy]()))
+    assert not torch.equal(learned, before)
 
 
 @pytest.mark.parametrize("algorithm", [name for name in METHODS if name != "relaxed_ddpg"])
@@ -181,9 +180,8 @@ class Branching(LinearGain):
 
 
 def test_a_policy_that_cannot_be_traced_learns_by_torchrl_itself_and_a_notice_says_so():
-    found = ActorCritic(
-        PLANT, Branching([[0.2, 0.1]]), LearnerConfig(critic_iterations=2, actor_iterations=2), generator=seeded()
-    )
+    config = LearnerConfig(critic_iterations=2, actor_iterations=2)
+    found = ActorCritic(PLANT, Branching([[0.2, 0.1]]), config, generator=seeded())
     found.store(explored(20))
     before = found.policy.gain.detach().clone()
     with pytest.warns(UserWarning, match="Step 2 is slower, because Branching cannot be traced"):
@@ -269,9 +267,7 @@ def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, orde
     call, sample = Iteration.__call__, memory.sample
 
     def noted(iteration, batch):
-        kinds.append(
-            {(True, False): "critic", (False, True): "actor", (True, True): "both"}[iteration.critic, iteration.actor]
-        )
+        kinds.append("both" if iteration.critic and iteration.actor else "critic" if iteration.critic else "actor")
         return call(iteration, batch)
 
     monkeypatch.setattr(Iteration, "__call__", noted)
@@ -313,15 +309,9 @@ def test_policy_finds_the_optimal_gain(algorithm, updates, spread, options, unch
 def episode(n):
     """Observations k, rewards k + 1, truncated at the end."""
     k = torch.arange(n, dtype=torch.float64).unsqueeze(-1)
-    done = torch.zeros(n, 1, dtype=torch.bool)
-    done[-1] = True
-    following = {
-        "observation": (k + 1).expand(n, 2),
-        "reward": k + 1,
-        "done": done,
-        "terminated": torch.zeros_like(done),
-    }
-    return TensorDict({"observation": k.expand(n, 2), "action": k, "next": following, "state": k}, [n])
+    found = transitions(k.expand(n, 2), k, k + 1, (k + 1).expand(n, 2)).set("state", k)
+    found["next", "done"][-1] = True
+    return found
 
 
 def summing(return_steps, discount=0.5, **options):
@@ -350,7 +340,7 @@ def test_the_target_discounts_by_the_steps_it_has_summed():
 
 
 def memory(capacity=10, seed=0, **options):
-    return LongTermMemory(capacity, generator=torch.Generator().manual_seed(seed), **options)
+    return LongTermMemory(capacity, generator=seeded(seed), **options)
 
 
 def labelled(labels):
