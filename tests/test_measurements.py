@@ -97,6 +97,13 @@ def test_slopes_of_all_sensors_are_those_of_finite_differences(name, kind, which
         torch.testing.assert_close(slopes[..., k], difference, rtol=1e-4, atol=1e-5)
 
 
+def test_rates_by_filters_have_no_sensor_where_the_plant_has_no_filters():
+    assert "speed_rate" in known_sensors(WindTurbine(observe=("speed_rate",)))
+    assert "speed_rate" not in known_sensors(WindTurbine())
+    assert "filtered_rate_x" in known_sensors(FlappingWing(observe=("position",)))
+    assert "filtered_rate_x" not in known_sensors(FlappingWing())
+
+
 # Previews
 
 

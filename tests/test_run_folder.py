@@ -250,7 +250,11 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize(
     ("where", "failing", "said"),
     [
-        ((Path, "read_bytes"), Mock(side_effect=OSError(errno.ESTALE, "stale")), "stale"),  # without a name
+        (
+            (Path, "read_bytes"),
+            Mock(side_effect=OSError(errno.ESTALE, "")),
+            os.strerror(errno.ESTALE),
+        ),  # without a name
         ((Path, "read_bytes"), Mock(side_effect=MemoryError), os.strerror(errno.ENOMEM)),
         ((torch, "load"), lambda *_, **__: torch.empty(2**57), os.strerror(errno.ENOMEM)),
     ],
