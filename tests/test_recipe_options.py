@@ -46,10 +46,9 @@ def test_the_paper_is_one_option(plant):
     """Its policy, observations, cost and numbers of gradients; the other defaults are apart from them."""
     made, paper = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant, "--preset", "paper")
     row = getattr(made, f"PAPER_{ROWS[plant]}")
-    assert paper.twinning == row != of_command_line(plant, "--start", "random").twinning == made.DEFAULT
-    usual = of_command_line(plant).twinning
-    quiet = dataclasses.replace(made.DEFAULT.exploration, spread=0.02)
-    assert usual == dataclasses.replace(made.DEFAULT, exploration=quiet) != made.DEFAULT
+    usual = of_command_line(plant)
+    assert paper.twinning == row != made.DEFAULT == usual.twinning
+    assert [config.effective().twinning.exploration.noise for config in (usual, paper)] == [0.02, 0.2]
     spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
     assert dataclasses.replace(spelled, preset="paper", observe=(), twinning=row) == paper
     assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost

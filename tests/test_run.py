@@ -84,8 +84,7 @@ def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
 
 
 def test_the_twin_follows_a_system_that_wears(tmp_path):
-    assimilation = AssimilationConfig(method="levenberg_marquardt", inputs="record")
-    twinning = dataclasses.replace(SMALL, assimilation=assimilation)
+    twinning = dataclasses.replace(SMALL, records=1)
     run = small_run(tmp_path, plant=LinearQuadratic(horizon=4.0), config=Worn, twinning=twinning)
     found = run.train()
     closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]

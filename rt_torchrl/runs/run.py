@@ -97,9 +97,8 @@ class Run:
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
-        if config.start is None:
-            config = dataclasses.replace(config, start="random" if first is None else "controller")
-        self.config = config.effective()
+        begins = config.start or ("random" if first is None else "controller")
+        self.config = dataclasses.replace(config, start=begins).effective()
         self.ended: str | None = None
         self.callbacks = callbacks
         device = require_device(config.device)
@@ -107,9 +106,9 @@ class Run:
         real = env if isinstance(env, RealSystem) or env is None else env()
         physics = known_physics(config, plant, real, first, baselines).to(device)
         laws = dict(baselines or {})
-        if config.start == "controller" and first is not None and first not in laws.values():
+        if begins == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
-        self._start = start_of(config, physics, first)
+        self._start = start_of(self.config, physics, first)
         if threads := real_side.learner_threads(config):
             torch.set_num_threads(threads)
         self._held = RunFolder(config, plant.name)

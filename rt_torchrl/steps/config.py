@@ -204,8 +204,8 @@ class TwinningConfig:
         arm: part of the algorithm that runs: ``twinning`` for all six steps, ``model_free`` for steps 1 and 2 alone, or
             else ``model_based`` for steps 1, 3, 4 and 5 alone.
         realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
-        records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
-            from at least as many.
+        records: number n_S of latest real episodes that step 4 trains the twin on, few of a system that wears; steps 5
+            and 6 draw exogenous inputs from at least as many.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies;
             twenty times as many where episodes may end early.
         limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
