@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_algorithm import STEPS, twinning
 from test_export_recipe import RECIPES
 
-from rt_torchrl import PlannerConfig, ReinforcementTwinning, TwinningConfig
+from rt_torchrl import PlannerConfig, ReinforcementTwinning, Run, TwinningConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs import dashboard, results
 from rt_torchrl.runs.command_line import from_command_line
@@ -143,7 +143,9 @@ def test_the_options_of_a_run_run_again(tmp_path):
     file.write_text(json.dumps(settings_of(asked, "wind_turbine") | {"ran": []}, default=str))
     again = from_command_line(TURBINE, ["--config", str(file), "--seed", "4"])
     assert (again.policy, again.seed, again.twinning) == ("bias", 4, asked.twinning)
-    assert (again.log_dir, again.config) == (None, file)
+    assert (again.log_dir, again.config) == (None, None)
+    with pytest.raises(ValueError, match=r"config=.* is for a command line; in code take load_run\(folder\).config"):
+        Run(dataclasses.replace(again, config=file), LinearQuadratic())
 
 
 def test_a_file_may_hold_a_few_options(tmp_path):

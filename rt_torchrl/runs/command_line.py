@@ -104,7 +104,9 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
     else:
         default = tyro.MISSING_NONPROP
     if not helped:
-        return tyro.cli(config_class, args=rest, default=default)
+        config = tyro.cli(config_class, args=rest, default=default)
+        # The file has been read now.
+        return dataclasses.replace(config, config=None) if isinstance(config, RunConfig) else config
     registry = ConstructorRegistry()
 
     @registry.struct_rule

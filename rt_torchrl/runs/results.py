@@ -276,7 +276,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     twin = " on the twin" if on_the_twin(unseen) else ""
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
-    lines.append(f"  {'cost':<{width}}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
+    lines.append(f"  {'cost':<{width}}{'untrained':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
     # A twin has no J_p on episodes that it has flown itself.
     rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", summary["J_p_ratio"])]
     for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):

@@ -96,6 +96,8 @@ class Run:
         self.started = time.perf_counter()
         if learner is not None and replay is not None:
             raise ValueError("replay belongs to ActorCritic; give it to the learner, or leave the learner out.")
+        if config.config is not None:
+            raise ValueError(f"config={config.config} is for a command line; in code take load_run(folder).config.")
         quieten_libraries()  # before the check of the plant, whose Jacobians are the first to speak
         begins = config.start or ("random" if first is None else "controller")
         self.config = dataclasses.replace(config, start=begins).effective()
@@ -350,7 +352,8 @@ class Run:
             better = judged[summary["better"]].control_costs.mean().item()
             summary["reference"] = results.reference_of(self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
-        summary["seconds"]["total"] = time.perf_counter() - self.started
+        total = time.perf_counter() - self.started
+        summary["seconds"] |= {"rest": total - sum(summary["seconds"].values()), "total": total}
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
         # Metrics of an earlier end must not lie beside these weights, because they say that the run is finished.

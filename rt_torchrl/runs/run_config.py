@@ -68,8 +68,8 @@ class RunConfig:
             run: its policies and its closure go on. A log, as a .csv or .parquet file that identify.py reads: the twin
             is fitted to it, and the policies imitate the actions in it. random: random weights.
         log: how the log is read that the training begins with.
-        config: file with options, such as config.json of a run, which then runs again; options that are given beside it
-            replace those of the file, and log_dir and resume are never taken from it.
+        config: file with options, such as config.json of a run, which then runs again, for a command line; options that
+            are given beside it replace those of the file, and log_dir and resume are never taken from it.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir, with the options of its run.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
