@@ -120,8 +120,10 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
     # A slope that the fit has not reached is off by as much more.
-    off = 10.0 * error
     with torch.no_grad():
-        closure.w.add_(off)
+        (logarithm,) = closure.parameters()
+        off = closure.coefficients.item()
+        logarithm.add_(0.01)
+        off = closure.coefficients.item() - off
     (wider,) = fit.uncertainty([record]).standard_errors().values()
     assert wider == pytest.approx(off, rel=0.02)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from test_algorithm import twinning, weights
-from test_belief import EPISODES, REFUTED, Content, belief_of, gains, said
+from test_belief import EPISODES, REFUTED, Hasty, belief_of, gains, said
 from test_first_controller import begun
 
 from rt_torchrl import Descended, DescentConfig, DigitalTwin, Scenario
@@ -181,7 +181,7 @@ class Trapped(VirtualEpisodes):
         return 1000.0 if (episodes.initial_state.abs() > 3.0).any() and gain < 1.0 else gain
 
 
-class Greedy(Content):
+class Greedy(Hasty):
     """A planner that goes to a small gain, or to a greater one where it sees extreme starts."""
 
     def __init__(self, policy, wary):
