@@ -5,9 +5,10 @@ import io
 import re
 import shlex
 from functools import cache
+from pathlib import Path
 
 import pytest
-from printed_commands import ROOT, commands, options
+from printed_commands import ROOT, TEXTS, commands, options
 
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.run_config import RunConfig
@@ -16,6 +17,8 @@ from rt_torchrl.runs.settings import module_of
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
 OF_A_RECIPE = [command for command in commands() if "recipes/" in command]
+PYTEST, MYPY = "uv run --group test pytest", "uv run --group test --group lint mypy"
+BUILD = "uv run --group docs sphinx-build -W --keep-going docs docs/_build"
 
 
 def whole(name, arguments):
@@ -28,11 +31,15 @@ def whole(name, arguments):
     return ["log.csv", *system, *arguments]
 
 
+NO_OPTIONS = ROOT / "tests" / "no_options.json"
+"""A file of options that gives none, in the place of one that a run leaves."""
+
+
 def refusal(name, arguments):
     """What the command line of a recipe says against these arguments, or None."""
-    if "--config" in arguments:  # of a run that is not there
+    if "--config" in arguments:
         place = arguments.index("--config") + 1
-        arguments = [*arguments[:place], str(ROOT / "tests" / "no_options.json"), *arguments[place + 1 :]]
+        arguments = [*arguments[:place], str(NO_OPTIONS), *arguments[place + 1 :]]
     if issubclass(CONFIGS[name], RunConfig):
         arguments = [*arguments, "--log-dir", "somewhere"]  # what --resume needs, and --help does not mind
     said = io.StringIO()
@@ -60,11 +67,17 @@ def test_a_recipe_takes_the_options_that_a_sentence_names(given):
     """Some recipe does; an option that is named without its value stands in its help."""
     arguments = shlex.split(given)
     flags = [word for word in arguments if word.startswith("--")]
-    recipes = ("wind_turbine", *RECIPES)  # most sentences are about the turbine
-    having = [name for name in recipes if all(re.search(rf"{flag}\b", help_of(name)) for flag in flags)]
+    # Most sentences are about the turbine.
+    having = [
+        name for name in ("wind_turbine", *RECIPES) if all(re.search(rf"{flag}\b", help_of(name)) for flag in flags)
+    ]
     assert having, given
-    if len(arguments) > 1:
-        assert any(refusal(name, whole(name, arguments)) is None for name in having)
+    refusals = []
+    for name in having if len(arguments) > 1 else ():
+        refusals.append(refusal(name, whole(name, arguments)))
+        if refusals[-1] is None:
+            return
+    assert not refusals, refusals
 
 
 @cache
@@ -77,12 +90,53 @@ def help_of(name):
 
 def test_an_option_that_does_not_exist_is_found():
     """Otherwise the tests above would show nothing."""
-    assert "--planer" in refusal("wind_turbine", ["--planer", "1"]) and refusal("wind_turbine", ["--policy", "cubic"])
+    assert "--planer" in refusal("wind_turbine", ["--planer", "1"])
+    assert refusal("wind_turbine", ["--policy", "cubic"]) and refusal(
+        "identify", whole("identify", ["--initial", "guessed"])
+    )
 
 
-PACKAGES = {"lint-imports": "import-linter", "sphinx-build": "sphinx"}
-"""The packages of programs that ``uv run`` starts, where they have another name."""
-FILES = [".ci/run", ".ci/nightly", ".pre-commit-config.yaml", "pyproject.toml", "tests/test_fault_campaign.py"]
+def test_checks_that_are_printed_are_what_ci_runs():
+    """The tests do not run themselves, nor the type checker over everything."""
+    script = [line.removesuffix(" &") for line in (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()]
+    assert {MYPY, BUILD} <= set(script)
+    assert any(line.startswith(f"{PYTEST} -n 2 --dist loadfile") for line in script)
+    rest = [command for command in commands() if command not in OF_A_RECIPE]
+    known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
+    known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
+    known |= {"uv run tests/ruler.py", "uv run tests/ruler.py --seeds 5"}  # an hour
+    known |= {"uv run --group nightly tests/fast_gradients.py"}  # tests/test_benchmark.py
+    known |= {"uv run --group nightly tests/learners.py"}  # half an hour
+    known |= {
+        command
+        for command in rest
+        if re.fullmatch(r"uv run --group nightly tests/peers\.py \w+( --[a-z]+ \d+)*", command)
+    }
+    known |= {command for command in rest if command.startswith("uv run --extra rosco tests/rosco_peer.py ")}  # an hour
+    known |= {"uv run docs/gallery.py"}  # tests/test_documentation.py
+    known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
+    known |= {f"{PYTEST} -m faults"}
+    assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
+    assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
+
+
+PACKAGES = {
+    "lint-imports": "import-linter",
+    "mypy": "mypy",
+    "pre-commit": "pre-commit",
+    "pytest": "pytest",
+    "ruff": "ruff",
+    "sphinx-build": "sphinx",
+    "tensorboard": "tensorboard",
+}
+"""The package of each program that ``uv run`` starts."""
+FILES = [
+    ".ci/run",
+    ".ci/nightly",
+    ".pre-commit-config.yaml",
+    "pyproject.toml",
+    "tests/test_fault_campaign.py",
+]
 
 
 def test_a_command_asks_for_the_groups_that_have_its_program():
@@ -90,11 +144,32 @@ def test_a_command_asks_for_the_groups_that_have_its_program():
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     texts = [(ROOT / name).read_text(encoding="utf-8") for name in FILES]
-    for command in {*commands(), *(found for text in texts for found in re.findall(r"uv run [^`\n]+", text))}:
-        words, needed = shlex.split(command)[2:], [*declared["project"]["dependencies"]]
-        while words[0] in ("--group", "--extra", "--with"):
-            if words[0] == "--group":
-                needed += declared["dependency-groups"][words[1]]
+    given = [*commands(), *(found for text in texts for found in re.findall(r"uv run [^`\n]+", text))]
+    tried = set()
+    for command in given:
+        words = shlex.split(command)[2:]
+        asked = {"--group": [], "--extra": [], "--with": []}
+        while words[0] in asked:
+            asked[words[0]].append(words[1])
             words = words[2:]
-        package = PACKAGES.get(words[0], words[0])
-        assert package.endswith(".py") or any(re.match(rf"{package}\b(?!-)", text) for text in needed), command
+        extras = declared["project"]["optional-dependencies"]
+        there = [text for group in asked["--group"] for text in declared["dependency-groups"][group]]
+        there += [f"rt_torchrl[{extra}]" for extra in asked["--extra"]]
+        there = [*declared["project"]["dependencies"], *(text for one in there for text in direct(one, extras))]
+        names = {re.match(r"[\w.-]+", text).group().lower() for text in there}
+        if words[0] in PACKAGES:
+            assert PACKAGES[words[0]] in names, command
+            tried.add(words[0])
+        else:
+            assert words[0].endswith(".py"), command
+    assert tried == PACKAGES.keys()
+
+
+def direct(requirement, extras):
+    """The requirement; of the library with some of its extras, the requirements of these."""
+    own = re.fullmatch(r"rt_torchrl\[(.+)\]", requirement)
+    return [text for extra in own[1].split(",") for text in direct_of(extra, extras)] if own else [requirement]
+
+
+def direct_of(extra, extras):
+    return [text for requirement in extras[extra] for text in direct(requirement, extras)]

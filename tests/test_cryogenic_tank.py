@@ -10,6 +10,7 @@ from saturation_tables import HIGH, LOW, table_of
 from seeds_and_numbers import double, seeded
 
 from rt_torchrl import DivergenceError, Rollout, rk4_step
+from rt_torchrl.envs.cryogenic_tank import saturation
 from rt_torchrl.envs.cryogenic_tank.closures import CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.saturation import DATA, FLUIDS, Saturation
@@ -44,6 +45,13 @@ def coolprop_rates(T_s, V_l, p, drop, load):
     ]
     V_dot, p_dot = np.linalg.solve(matrix, [-flow, into_fluid - flow * value["h_l"] - heat])
     return [(load - into_fluid) / M_C, V_dot, p_dot]
+
+
+@torch.no_grad()
+def flown(plant, p, drop, load, n, closure=None):
+    """States of ``n`` intervals from rest, one row per initial pressure, under held actions and loads."""
+    action, load = (double(*x).view(-1, 1, 1).expand(-1, n, 1) if isinstance(x, tuple) else x for x in (drop, load))
+    return Rollout(plant, closure or plant.closure)(plant.state_at(double(*p)), load, action).states
 
 
 @pytest.fixture(scope="module")
@@ -107,10 +115,18 @@ def test_rates_are_those_of_coolprop(plant):
 def test_a_pressure_beyond_the_table_is_a_divergence(plant):
     load = torch.full((1, 100, 1), 1e6, dtype=torch.float64)
     with pytest.raises(DivergenceError, match="cryogenic_tank.*diverged"):
-        Rollout(plant, plant.closure)(plant.state_at(double(895e3)), load, 0.0 * load)
+        flown(plant, (895e3,), 0.0 * load, load, 100)
 
 
 # Closure, policy, costs
+
+
+def test_closure_starts_where_the_paper_does(plant):
+    start = plant.make_closure(seeded()).named_coefficients()
+    assert {name: value.item() for name, value in start.items()} == pytest.approx(
+        {"U_s": 1.0, "U_HX": 1.0, "K_JT": 10e9}
+    )
+    assert not any(weight.requires_grad for weight in plant.parameters())
 
 
 def test_policy_is_the_papers(plant):
@@ -160,11 +176,11 @@ class Ledger:
         tank, V_l = self.plant.saturation(state[..., 2]), state[..., 1]
         return tank.rho_l * V_l + tank.rho_v * (V_T - V_l)
 
-    def energy(self, state):
+    def energy(self, state, heat_capacity=M_C):
         """Energy H − pV of wall and mixture."""
         tank, V_l, p = self.plant.saturation(state[..., 2]), state[..., 1], state[..., 2]
         enthalpy = tank.rho_l * tank.h_l * V_l + tank.rho_v * tank.h_v * (V_T - V_l)
-        return M_C * state[..., 0] + enthalpy - p * V_T
+        return heat_capacity * state[..., 0] + enthalpy - p * V_T
 
 
 @pytest.mark.parametrize(
@@ -177,8 +193,22 @@ def test_vent_at_the_set_point(plant, drop, flow, heat, held):
     assert 1e3 * vent.flow.item() == pytest.approx(flow, abs=6e-4)  # half a unit of the last digit
     assert vent.heat.item() == pytest.approx(heat, abs=0.6)
     assert plant.held_load(state, action, plant.closure).item() == pytest.approx(held, abs=0.6)
-    vented = plant.vented_mass(state.expand(3, 3), action.expand(2, 1), plant.closure)
-    torch.testing.assert_close(vented, vent.flow * plant.dt * torch.arange(3))
+
+
+@pytest.fixture(scope="module")
+def shut_and_open():
+    """A shut tank at 500 kPa and one at 540 kPa with the valve wide open, under mean loads, over 120 h."""
+    plant = CryogenicTank(dt=240.0)  # nothing changes fast under a constant load
+    return plant, flown(plant, (500e3, 540e3), (0.0, 200e3), (129.0, 128.5), 1800)
+
+
+def assert_balances(ledger, first, last):
+    vented, enthalpy, heat = last[..., 3:].unbind(-1)
+    mass = ledger.mass(first)
+    torch.testing.assert_close(ledger.mass(last) + vented, mass, rtol=1e-8, atol=0)
+    # Relative to the energy that went through the tank, the heat of the load.
+    gap = ledger.energy(last) - ledger.energy(first) - (heat - enthalpy)
+    assert (gap.abs() < 1e-8 * heat).all()
 
 
 @pytest.mark.parametrize("n", [480, pytest.param(14_400, marks=pytest.mark.nightly)])
@@ -190,14 +220,38 @@ def test_mass_and_energy_are_conserved(plant, n):
     for k in range(n):
         state = ledger.step(state, policy(plant.observe(TIME_ZERO, state[:, :3], load[:, k])), load[:, k])
     assert state[:, 3].min() > 0.1
-    vented, enthalpy, heat = state[..., 3:].unbind(-1)
-    torch.testing.assert_close(ledger.mass(state) + vented, ledger.mass(first), rtol=1e-8, atol=0)
-    # Relative to the energy that went through the tank, the heat of the load.
-    gap = ledger.energy(state) - ledger.energy(first) - (heat - enthalpy)
-    assert (gap.abs() < 1e-8 * heat).all()
+    assert_balances(ledger, first, state)
+
+
+def test_pressure_of_a_shut_tank(shut_and_open):
+    _, states = shut_and_open
+    assert 1e-3 * states[0, -1, 2].item() == pytest.approx(628.0, abs=3.0)
+
+
+def test_vent_wide_open_brings_an_over_pressure_down(shut_and_open):
+    plant, states = shut_and_open
+    k = int((states[1, :, 2] < 500e3).int().argmax())
+    actions = torch.full((1800, 1), 200e3, dtype=torch.float64)
+    assert k * plant.dt / 3600 == pytest.approx(38.0, abs=1.5)
+    assert plant.vented_mass(states[1], actions, plant.closure)[k].item() == pytest.approx(85.0, abs=2.0)
 
 
 # Saturation properties against CoolProp.
+
+
+KEYS = (("T", 0), ("D", 0), ("D", 1), ("H", 0), ("H", 1))
+
+
+def slopes_of_coolprop(fluid, p):
+    """First derivatives of T, ρ and h along the saturation line by CoolProp itself."""
+    state, columns = CP.AbstractState("HEOS", fluid), []
+    for key, quality in ((CP.iT, 0), (CP.iDmass, 0), (CP.iDmass, 1), (CP.iHmass, 0), (CP.iHmass, 1)):
+        column = []
+        for each in p:
+            state.update(CP.PQ_INPUTS, each, quality)
+            column.append(state.first_saturation_deriv(key, CP.iP))
+        columns.append(column)
+    return np.array(columns)
 
 
 # Properties
@@ -206,16 +260,13 @@ def test_mass_and_energy_are_conserved(plant, n):
 @pytest.mark.parametrize("fluid", FLUIDS)
 def test_values_and_slopes_are_those_of_coolprop(fluid):
     p = np.linspace(LOW, HIGH, 301)  # no nodes of the fit, except for the two ends
-    fit = Saturation(fluid).with_slopes(torch.from_numpy(p))
-    state, rows = CP.AbstractState("HEOS", fluid), []
-    for key, quality in ((CP.iT, 0), (CP.iDmass, 0), (CP.iDmass, 1), (CP.iHmass, 0), (CP.iHmass, 1)):
-        for each in p:
-            state.update(CP.PQ_INPUTS, each, quality)
-            rows.append((state.keyed_output(key), state.first_saturation_deriv(key, CP.iP)))
-    truth = np.array(rows).reshape(5, 301, 2)
-    for part, exact, share, inner in zip(fit, truth.T, (1e-6, 1e-4), (slice(None), slice(1, -1)), strict=True):
-        gap, size = np.stack([x.numpy() for x in part]) - exact.T, np.abs(exact.T).max(1)
-        assert (np.abs(gap)[:, inner].max(1) < share * size).all()
+    values, slopes = (
+        np.stack([x.numpy() for x in part]) for part in Saturation(fluid).with_slopes(torch.from_numpy(p))
+    )
+    truth = np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS])
+    assert (np.abs(values - truth).max(1) < 1e-6 * np.abs(truth).max(1)).all()
+    truth, slopes = slopes_of_coolprop(fluid, p[1:-1]), slopes[:, 1:-1]
+    assert (np.abs(slopes - truth).max(1) < 1e-4 * np.abs(truth).max(1)).all()
 
 
 def test_the_tables_are_those_that_coolprop_makes():
@@ -235,6 +286,21 @@ def test_derivatives_of_values_and_slopes():
     assert torch.autograd.gradcheck(scaled, log_p.requires_grad_())
 
 
+def test_second_derivative_is_continuous_across_cells():
+    fit = Saturation()
+    knots = torch.exp(
+        math.log(LOW) + (math.log(HIGH / LOW) / saturation.CELLS) * torch.arange(1, saturation.CELLS).double()
+    )
+    found = []
+    for side in (1.0 - 1e-9, 1.0 + 1e-9):
+        p = (knots * side).requires_grad_()
+        slope = fit.with_slopes(p)[1]
+        found.append(torch.stack([torch.autograd.grad(s.sum(), p, retain_graph=True)[0] for s in slope]))
+    sizes = found[0].abs().amax(1, keepdim=True)
+    # Rounding of the values, 1e-14 or so, over the square of a cell's width of 0.02.
+    assert ((found[1] - found[0]).abs() < 1e-7 * sizes).all()
+
+
 # Outside the range
 
 
@@ -245,4 +311,17 @@ def test_outside_the_range_everything_is_nan_and_check_raises(p):
     assert all(x[0].isnan() and x[1].isfinite() for x in (*values, *slopes))
     with pytest.raises(ValueError, match="Hydrogen, 80 … 900 kPa"):
         fit.check(double(p, 500e3))
-    fit.check(double(LOW, HIGH))  # the ends belong to it
+
+
+def test_check_names_the_worst_pressure_and_accepts_the_ends():
+    fit = Saturation()
+    with pytest.raises(ValueError, match="p=1200 kPa"):
+        fit.check(double(79e3, 500e3, 1200e3))
+    fit.check(double(LOW, HIGH))
+    assert all(x.isfinite().all() for x in fit(double(LOW, HIGH)))
+
+
+def test_modules_do_not_share_their_buffers():
+    one, other = Saturation(), Saturation()
+    one.table.zero_()
+    assert other.table.abs().max() > 0

@@ -215,6 +215,8 @@ def test_a_training(train, recipe, options):
     episodes = train(recipe, **options)
     last = episodes[-1]
     assert last["real_cost"] > 0.0 and last["critic_gradient"] > 0.0 and last["J_p"] <= last["J_p_before"]
+    if "twinning" in options and "assimilation" in options["twinning"]:
+        assert last["J_p"] < last["J_p_before"]
     if "episodes" in options:
         assert "clone" in [episode["event"] for episode in episodes]
 

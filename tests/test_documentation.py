@@ -1,5 +1,6 @@
 """README and documentation: their code and plants run, names have entries, the site builds without warnings."""
 
+import ast
 import importlib
 import importlib.util
 import json
@@ -13,12 +14,11 @@ import fresh_process
 import pytest
 import torch
 from printed_commands import ROOT, TEXTS, blocks
-from seeds_and_numbers import seeded
 from tensordict import TensorDict
-from test_export_recipe import leave_run
+from test_export_recipe import RECIPES, leave_run
 
 import rt_torchrl
-from rt_torchrl import AssimilationConfig, HypothesesConfig, Rollout, check_plant
+from rt_torchrl import AssimilationConfig, HypothesesConfig, Rollout, Trajectory, check_plant
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
@@ -34,13 +34,13 @@ def test_every_page_with_code_is_run():
             assert any(re.search(rf"\b{page}\b", text) for text in others), page
 
 
-def scope_of(page, which=slice(None), **words):
-    """What the code of a page defines, or that of some of its blocks, with other words in the place of some."""
-    code, scope = "\n".join(blocks(page, "python")[which]), {"__name__": "page"}
-    for word, other in {"runs/wind_turbine/TIME-seed-0": "run", **words}.items():
-        code = code.replace(word, other)
-    exec(compile(code, page, "exec"), scope)
-    return scope
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_import_of_a_page_exists(page):
+    for block in blocks(page, "python"):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("rt_torchrl"):
+                module = importlib.import_module(node.module)
+                assert all(hasattr(module, name.name) for name in node.names), ast.unparse(node)
 
 
 def leave_finished_run(folder):
@@ -61,45 +61,80 @@ def leave_finished_run(folder):
 def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
     leave_finished_run(tmp_path / "run")
     monkeypatch.chdir(tmp_path)
-    scope_of("finished_run.md", **{"diagnose(run)": "diagnose(run, episodes=2)"})
+    code = "\n".join(blocks("finished_run.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
+    exec(compile(code.replace("diagnose(run)", "diagnose(run, episodes=2)"), "docs/finished_run.md", "exec"), {})
     shown = capsys.readouterr().out
     assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
     assert shown.count(" | ") == 7 * 3  # seven reasons
-    scope_of("gallery.md")
-    assert len(list(Path().glob("*.png"))) == 4
+    assert (tmp_path / "states.png").exists() and (tmp_path / "learning.png").exists()
+
+
+def tutorial_with_suspects():
+    """What the plant of the tutorial and the page of hypotheses define."""
+    scope = {"__name__": "tutorial"}
+    exec(compile(blocks("own_plant.md", "python")[0], "docs/own_plant.md", "exec"), scope)
+    exec(compile("\n".join(blocks("hypotheses.md", "python")), "docs/hypotheses.md", "exec"), scope)
+    return scope
+
+
+def test_the_suspects_of_the_tutorial_plant_are_plants():
+    scope = tutorial_with_suspects()
+    found = scope["Tank"]().suspects()
+    assert list(found) == ["pump lags", "pump late"] and all(len(plant.states) > 2 for plant in found.values())
+    assert list(scope["LeakyTank"]().suspects()) == [*found, "leaks"]
+    tank = scope["SuspiciousTank"]()
+    twin = make_twin(tank, tank.closure, HypothesesConfig(which=("unknown flow", "pump lags")))
+    assert set(twin.twins) == {ALONE, "unknown flow", "pump lags"}
 
 
 def test_the_extension_of_the_documentation_finds_a_leak():
-    scope = scope_of("own_plant.md", slice(1))
-    exec(compile("\n".join(blocks("hypotheses.md", "python")), "hypotheses.md", "exec"), scope)
-    tank, suspicious = scope["LeakyTank"](), scope["SuspiciousTank"]()
-    assert list(tank.suspects()) == ["pump lags", "pump late", "leaks"]
-    config = HypothesesConfig(which=("unknown flow", "pump lags"))
-    assert set(make_twin(suspicious, suspicious.closure, config).twins) == {ALONE, *config.which}
+    scope = tutorial_with_suspects()
+    real, tank = scope["Leak"](scope["TwoTanks"](), 4e-3), scope["LeakyTank"]()
     check_plant(tank.suspects()["leaks"], steps=10, traced=False)
-    real, generator = scope["Leak"](scope["TwoTanks"](), 4e-3), seeded()
+    generator = torch.Generator().manual_seed(0)
     commands = 2e-4 * torch.rand(1, tank.n_steps, 1, generator=generator, dtype=torch.float64)
-    start, inputs = real.draw_initial_state(1, generator), real.draw_exogenous(1, generator)
-    (record,) = Rollout(real, real.closure)(start, inputs, commands).each()
+    drawn = real.draw_initial_state(1, generator), real.draw_exogenous(1, generator)
+    record = [part[0] for part in Rollout(real, real.closure)(*drawn, commands)[:3]]
     config = HypothesesConfig(call=0.0, which=("leaks", "pump lags"))
     twin = make_twin(tank, tank.make_closure(generator), config)
     fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
-    EnsembleAssimilation(twin, fit, config).update([record], (), 1, generator)
+    EnsembleAssimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)
     found = twin.twins["leaks"].closure.named_coefficients()
     assert twin.weights == {"leaks": 1.0} and found["leak"].item() == pytest.approx(4e-3, rel=1e-3)
     assert found["lower_outlet"].item() == pytest.approx(4e-5, rel=1e-2)
 
 
 def test_the_real_turbine_has_what_its_twin_does_not_know():
-    scope = scope_of("unknown_systems.md")
+    scope = {}
+    exec(compile("\n".join(blocks("unknown_systems.md", "python")), "docs/unknown_systems.md", "exec"), scope)
     assert len(scope["real"].states) > len(scope["twin"].states)
 
 
-def test_the_callbacks_of_the_documentation_end_a_training_and_tell_a_logger(tmp_path, monkeypatch):
+def test_every_block_of_code_is_marked_as_python():
+    """A block in another spelling of the language would not be run."""
+    assert not any(blocks(page, "py") for page in TEXTS)
+
+
+def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
+    leave_finished_run(tmp_path / "run")
     monkeypatch.chdir(tmp_path)
-    scope = scope_of("habits.md", slice(2))
-    assert scope["cheap_enough"]([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
-    assert scope["cheap_enough"]([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
+    code = "\n".join(blocks("gallery.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
+    exec(compile(code, "docs/gallery.md", "exec"), {})
+    assert (tmp_path / "power_and_speed.png").exists() and (tmp_path / "flights.png").exists()
+
+
+def test_the_callback_of_the_documentation_ends_a_training():
+    scope = {}
+    exec(compile(blocks("habits.md", "python")[0], "docs/habits.md", "exec"), scope)
+    said = scope["cheap_enough"]
+    assert said([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
+    assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
+
+
+def test_the_callback_of_the_documentation_tells_a_logger(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scope = {}
+    exec(compile(blocks("habits.md", "python")[1], "docs/habits.md", "exec"), scope)
     record = {"episode": 0, "real_cost": 0.5, "rms/speed [rad/s]": 0.1, "live": "model_free"}
     assert scope["to_logger"]([record]) is None
     (curve,) = tmp_path.rglob("real_cost.csv")
@@ -111,24 +146,32 @@ def test_the_search_of_the_documentation_runs(tmp_path, monkeypatch):
     """As printed, with a single trial; the same code goes on with the search."""
     pytest.importorskip("optuna", reason="a search needs the extra sweep")
     monkeypatch.chdir(tmp_path)
+    code, scope = blocks("habits.md", "python")[2].replace("n_trials=10", "n_trials=1"), {}
     for done in (1, 2):
-        trials = scope_of("habits.md", slice(2, 3), **{"n_trials=10": "n_trials=1"})["search"].trials
-        assert len(trials) == done
-    files = (Path(f"runs/search/0-{seed}/metrics.json") for seed in (0, 1))
-    costs = [json.loads(file.read_text())["summary"]["unseen"]["J_a_model_based"]["mean"] for file in files]
-    assert trials[0].value == pytest.approx(sum(costs) / 2.0)
+        exec(compile(code, "docs/habits.md", "exec"), scope)
+        assert len(scope["search"].trials) == done
+    costs = [
+        json.loads(Path(f"runs/search/0-{seed}/metrics.json").read_text())["summary"]["unseen"]["J_a_model_based"]
+        for seed in (0, 1)
+    ]
+    assert scope["search"].trials[0].value == pytest.approx(sum(cost["mean"] for cost in costs) / 2.0)
 
 
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path):
-    needed = ("nbformat", "nbclient", "ipykernel")
-    nbformat, nbclient, _ = (pytest.importorskip(name, reason="the notebook needs the group test") for name in needed)
+    nbformat = pytest.importorskip("nbformat", reason="the notebook comes with the group test")
+    nbclient = pytest.importorskip("nbclient", reason="the notebook comes with the group test")
+    pytest.importorskip("ipykernel", reason="the notebook comes with the group test")
     notebook = nbformat.read(ROOT / "docs" / "first_steps.ipynb", as_version=4)
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert any("model_" in output.get("data", {}).get("text/plain", "") for output in shown)
     assert sum("image/png" in output.get("data", {}) for output in shown) == 2
     assert list((tmp_path / "runs" / "wind_turbine").glob("*/weights.pt"))
+
+
+def test_the_front_page_is_short():
+    assert len(TEXTS["README.md"].splitlines()) <= 130
 
 
 @pytest.mark.nightly  # .ci/run builds the site in every run; this is for those who run no .ci/run
@@ -142,32 +185,67 @@ def test_the_site_builds_without_warnings(tmp_path):
     assert not (tmp_path / "_build").exists()
 
 
-def test_the_code_of_the_readme_runs(monkeypatch):
+# The code and the commands of the README are right.
+
+
+TUTORIAL = (ROOT / "docs" / "own_plant.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_its_code_runs(monkeypatch):
+    from rt_torchrl import ReinforcementTwinning
+
     # The steps are tested elsewhere and take minutes here; what is tested is that the snippet builds them.
-    def first_step(training):
-        return training.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", training.referee.live))
+    monkeypatch.setattr(
+        ReinforcementTwinning,
+        "episode",
+        lambda self: self.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", self.referee.live)),
+    )
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    assert scope["report"]["real_cost"] > 0
 
-    monkeypatch.setattr(rt_torchrl.ReinforcementTwinning, "episode", first_step)
-    assert scope_of("README.md")["report"]["real_cost"] > 0
+
+def headings(page):
+    """The anchors of a page, as its renderers make them of its headings."""
+    found = re.findall(r"^#+ (.+)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in found}
 
 
-def test_files_that_the_readme_names_exist():
-    for link in re.findall(r"\]\(((?!http|#)[^)#]+)", TEXTS["README.md"]):
-        assert (ROOT / link).exists(), link
+def test_its_files_exist():
+    for link in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
+        path, _, heading = link.partition("#")
+        assert (ROOT / path).exists(), link
+        assert not heading or heading in headings(path), link
 
 
 @pytest.mark.slow
 def test_the_tutorial_runs_as_it_is_printed(tmp_path):
     """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
-    done = fresh_process.run("\n".join(blocks("own_plant.md", "python")), cwd=tmp_path)
+    code = "\n".join(re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL))
+    lines = [line for line in code.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) < 65
+    done = fresh_process.run(code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     upper, lower = map(float, re.findall(r"outlet': ([\d.e-]+)", done.stdout)[:2])
     # The inflow is measured without noise: to rounding.
     assert upper == pytest.approx(5e-5, rel=1e-9) and lower == pytest.approx(4e-5, rel=1e-9)
 
 
+def test_the_tutorial_says_what_the_check_says():
+    from rt_torchrl import PlantContractError
+
+    code = re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL)
+    scope = {"__name__": "tutorial"}
+    exec(code[0], scope)
+    with pytest.raises(PlantContractError, match="is too long for the eigenvalue"):
+        scope["check_plant"](scope["TwoTanks"](dt=600.0, horizon=1200.0), traced=False)
+
+
 def test_the_pictures_of_the_gallery_are_those_that_its_script_draws():
-    drawn = runpy.run_path(str(ROOT / "docs" / "gallery.py"))["PICTURES"]
+    page = (RECIPES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
+    drawn = runpy.run_path(str(RECIPES.parent / "docs" / "gallery.py"))["PICTURES"]
     pictures = {f"{plant}_{name}" for plant, names in drawn.items() for name in names}
-    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", TEXTS["gallery.md"]))
-    assert all((ROOT / "docs" / "gallery" / name).is_file() for name in pictures)
+    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", page))
+    assert all((RECIPES.parent / "docs" / "gallery" / name).is_file() for name in pictures)

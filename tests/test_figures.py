@@ -5,15 +5,16 @@ import math
 import sys
 from dataclasses import replace
 
+import matplotlib.colors
 import numpy as np
 import pytest
 import torch
-from figure_reading import clipped_texts, draw, line, panel, snapshot_of
+from figure_reading import clipped_texts, collisions, draw, line, panel, snapshot_of
 from linear_quadratic import LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
-from test_algorithm import twinning
+from small_runs import IDLE
 
-from rt_torchrl import Rollout, Snapshot, Trajectory, figures
+from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Signal, Snapshot, Trajectory, figures
 from rt_torchrl.envs.cryogenic_tank import figures as tank_figures
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -27,17 +28,33 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import flights
+from rt_torchrl.figures.style import ROLES
 from rt_torchrl.figures.training import RESOLUTION, closure_weights, visited_observations
 from rt_torchrl.runs.results import episode_record
-from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig, RefereeConfig, TwinningConfig
 
 EVERYWHERE = {"states", "policy_contours", "learning_curves"}
 
 
 def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
-    found = twinning(plant, arm=arm, referee=RefereeConfig(rule="decision_tree"))
-    initial = copy.deepcopy(found.twin.closure)
-    return Snapshot.take(found, initial, [episode_record(found.episode(), episode=k) for k in range(episodes)])
+    generator = torch.Generator().manual_seed(0)
+    policy = plant.make_policy(generator)
+    twin = DigitalTwin(plant, plant.make_closure(generator))
+    initial, reports = copy.deepcopy(twin.closure), []
+    config = TwinningConfig(
+        arm=arm,
+        realisations=2,
+        virtual_episodes=2,
+        learner=IDLE,
+        assimilation=AssimilationConfig(iterations=2),
+        planner=PlannerConfig(iterations=1),
+        referee=RefereeConfig(rule="decision_tree"),
+    )
+    policies = {"model_free": policy, "model_based": copy.deepcopy(policy)}
+    twinning = ReinforcementTwinning(PlantEnv(plant), twin, **policies, config=config, generator=generator)
+    for _ in range(episodes):
+        reports.append(episode_record(twinning.episode(), episode=len(reports)))
+    return Snapshot.take(twinning, initial, reports)
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +77,11 @@ def test_every_figure_is_drawn_within_its_canvas(name, request):
     drawn = figures.figures_of(snapshot)
     assert set(drawn) == EVERYWHERE | {"exogenous"}
     for figure in drawn.values():
-        assert draw(figure) and clipped_texts(figure) == []
+        assert draw(figure)
+        assert clipped_texts(figure) == [] and not collisions(figure)
+    # Nothing is left behind: no figure is registered anywhere.
     pyplot = sys.modules.get("matplotlib.pyplot")
-    assert pyplot is None or pyplot.get_fignums() == []  # no figure is registered anywhere
+    assert pyplot is None or pyplot.get_fignums() == []
 
 
 @pytest.mark.parametrize("name", ["oscillator", "turbine"])
@@ -76,6 +95,7 @@ def test_states_are_record_and_replay_with_units_and_residual(name, request):
         assert line(ax, "real").get_xdata()[-1] == pytest.approx(plant.horizon, rel=1e-12)
     residual = (snapshot.replay[:, 0] - snapshot.record.states[:, 0]).square().mean().sqrt()
     assert figure.axes[0].get_title(loc="right") == f"RMS {residual:.2g} {plant.states[0].unit}"
+    assert "time [s]" in draw(figure)
 
 
 def test_an_error_of_a_whole_turn_is_none(oscillator):
@@ -97,8 +117,9 @@ def test_exogenous_shows_record_mean_and_samples(turbine):
     assert same(line(above, "recorded"), turbine.record.exogenous[:, 0])
     for ax in (above, below):
         assert same(line(ax, "large scale (SVR)"), turbine.large_scale[:, 0])
-    samples = next(drawn for drawn in below.lines if "sample" in drawn.get_label())
-    assert same(samples, turbine.realisations[0, :, 0])
+        assert ax.get_title(loc="left") == turbine.plant.inputs[0].label
+    assert same(line(below, "3 samples"), turbine.realisations[0, :, 0])
+    assert len(below.lines) == 4
 
 
 @pytest.mark.parametrize("name", ["oscillator", "turbine"])
@@ -128,11 +149,19 @@ def test_contours_are_the_policies(name, request, monkeypatch):
     assert {signal.label for signal in (*snapshot.plant.actions, *snapshot.plant.observations)} <= labels
 
 
+class Observing(LinearQuadratic):
+    """The oscillator seen through the first of its states."""
+
+    observations = (Signal(symbol="e", name="error", unit="-", low=-1.0, high=1.0),)
+
+    def observe(self, t, state, exogenous):
+        return state[..., :1]
+
+
 def test_policies_of_one_observation_are_curves(oscillator):
-    plant = copy.deepcopy(oscillator.plant)
-    plant.observations, plant.observe = plant.observations[:1], lambda t, state, exogenous: state[..., :1]
-    policies = {"model_based": LinearGain([[0.5]]), "model_free": LinearGain([[0.0]])}
-    figure = figures.policy_contours(replace(oscillator, plant=plant, policies=policies))
+    gain = torch.tensor([[0.5]], dtype=torch.float64)
+    policies = {"model_based": LinearGain(gain), "model_free": LinearGain(0.0 * gain)}
+    figure = figures.policy_contours(replace(oscillator, plant=Observing(), policies=policies))
     curve = line(figure.axes[0], "model-based")
     np.testing.assert_allclose(curve.get_ydata(), -0.5 * curve.get_xdata(), rtol=1e-15)
 
@@ -156,6 +185,7 @@ def test_learning_curves_and_timeline(oscillator):
     assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
     assert spans == [[(0.5, 1.5), (1.5, 2.5)], [(2.5, 3.5), (3.5, 4.5)]]
     assert "Policies after episode 4" in str(draw(figures.policy_contours(replace(oscillator, episodes=episodes))))
+    assert draw(figure) and not collisions(figure)
 
 
 @pytest.mark.parametrize("arm", ["model_free", "model_based"])
@@ -164,12 +194,15 @@ def test_arms_leave_out_what_they_do_not_have(arm):
     drawn = figures.figures_of(snapshot)
     assert set(drawn) == EVERYWHERE | ({"exogenous"} if arm == "model_based" else set())
     assert len(drawn["learning_curves"].axes) == (2 if arm == "model_free" else 3)
+    for figure in drawn.values():
+        draw(figure)
+    draw(figures.exogenous(snapshot))
     bare = replace(snapshot, episodes=[])
     assert set(figures.figures_of(bare)) == set(drawn) - {"learning_curves"}
 
 
 def test_power_and_speed_against_their_references(turbine):
-    wind, speed, power, torque, pitch = turbine_figures.power_and_speed(turbine).axes
+    wind, speed, power, torque, pitch = axes = turbine_figures.power_and_speed(turbine).axes
     state, action = turbine.record.states[:-1], turbine.record.actions
     assert same(line(wind, "wind"), turbine.record.exogenous[:, 0])
     assert same(line(speed, "real"), 97.0 * state[:, 0])
@@ -179,6 +212,8 @@ def test_power_and_speed_against_their_references(turbine):
     assert line(power, r"reference $\tilde P$").get_ydata().max() <= 5.0
     assert line(speed, r"reference $\tilde\omega_g$").get_ydata().max() <= 122.9096
     assert same(line(torque, "applied"), 1e-3 * action[:, 0]) and same(line(pitch, "applied"), action[:, 1])
+    units = [ax.get_title(loc="left").split("[")[1] for ax in axes]
+    assert units == ["m/s]", "rad/s]", "MW]", "kN m]", "deg]"]
 
 
 def flown(plant, count=1, n=40):
@@ -215,24 +250,36 @@ def test_every_controller_is_drawn_and_the_setpoint_once():
     one = flown(plant)
     other = JonkmanController(plant).fly(one.states[:, 0], one.exogenous)
     figure = flights(plant, {"model_based": one.each()[0], "Jonkman": other.each()[0]})
+    assert len(figure.axes) == 2 + len(plant.actions)
     labels = [line.get_label() for line in figure.axes[0].lines]
     assert labels == ["model-based", "setpoint", "Jonkman"]
     speed = figure.axes[0].lines[2]
     assert speed.get_ydata() == pytest.approx(97.0 * other.states[0, :-1, 0].numpy())
+    assert matplotlib.colors.same_color(figure.axes[0].lines[0].get_color(), ROLES["model_based"])
     assert figure.axes[2].lines[0].get_ydata() == pytest.approx(one.actions[0, :, 0].numpy())
 
 
-def test_every_episode_is_a_point_and_every_mean_a_bar():
+COUNT = 12
+
+
+def judged(*names):
     generator = torch.Generator().manual_seed(0)
-    costs, merit = torch.rand(2, 3, 12, generator=generator, dtype=torch.float64) + 0.1
-    pairs = zip(("model_based", "model_free", "PD"), costs, merit, strict=True)
-    figure = figures.unseen({name: Judged(cost, {"distance [m]": far}) for name, cost, far in pairs})
-    for ax, expected in zip(figure.axes, (costs, merit), strict=True):
+    values = {name: torch.rand(2, COUNT, generator=generator, dtype=torch.float64) + 0.1 for name in names}
+    return {name: Judged(costs, {"final distance [m]": 100.0 * merit}) for name, (costs, merit) in values.items()}
+
+
+def test_every_episode_is_a_point_and_every_mean_a_bar():
+    found = judged("model_based", "model_free", "PD")
+    figure = figures.unseen(found)
+    draw(figure)
+    assert len(figure.axes) == 2
+    for ax, pick in zip(figure.axes, ("costs", "merit"), strict=True):
         shown = [line for line in ax.lines if line.get_marker() == "o"]
         bars = [line for line in ax.lines if line.get_marker() == "None"]
-        for column, values in enumerate(expected):
-            assert np.array_equal(shown[column].get_ydata(), values)
-            assert np.allclose(bars[column].get_ydata(), values.mean().item())
+        for column, (who, values) in enumerate(found.items()):
+            expected = values.control_costs if pick == "costs" else values.merit["final distance [m]"]
+            assert np.array_equal(shown[column].get_ydata(), expected)
+            assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
             assert (np.abs(shown[column].get_xdata() - column) < 0.3).all()
 
 
@@ -271,6 +318,9 @@ def test_tank_is_the_record(tank):
     load = panel(figure, "heat load")
     assert np.array_equal(line(load, "real").get_ydata(), tank.record.exogenous[:, 0].numpy())
     assert np.array_equal(line(load, "large scale (SVR)").get_ydata(), tank.large_scale[:, 0].numpy())
+    units = [ax.get_title(loc="left").split("[")[1] for ax in figure.axes]
+    assert units == ["kPa]", "kg]", "kg]", "K]", "g/s]", "W]"]
+    assert load.get_xlabel() == "time [h]"
     assert load.get_xlim() == pytest.approx((0.0, 6.0), rel=1e-12)
 
 
@@ -290,6 +340,7 @@ def test_long_records_are_thinned_to_mean_and_range(tank):
     assert drawn[-1] == values[-1]
     vertices = load.collections[0].get_paths()[0].vertices[:, 1]
     assert (vertices.min(), vertices.max()) == (values.min(), values.max())
+    assert any("every 1.5 min" in text for text in draw(figure))
 
 
 def test_heat_exchanger_of_each_closure(tank):
@@ -310,14 +361,20 @@ def test_heat_exchanger_of_each_closure(tank):
     mean = tank.record.exogenous.mean().item()
     assert line(held, "mean load of the last episode").get_ydata()[0] == mean
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert all("[W]" in ax.get_title(loc="left") for ax in (heat, held))
+    assert share.get_xlabel().endswith("[kPa]")
 
 
 def test_closure_weights_with_truth_start_and_units(tank):
-    for ax, (name, found) in zip(closure_weights(tank).axes, FOUND.items(), strict=True):
+    figure = closure_weights(tank)
+    low, high = figure.axes[0].get_xlim()
+    assert low < 1 and high > len(tank.episodes)
+    for ax, (name, found) in zip(figure.axes, FOUND.items(), strict=True):
         assert list(line(ax, "twin").get_ydata()) == found
         assert line(ax, "true").get_ydata()[0] == pytest.approx(TRUE[name], rel=1e-14)
         start = tank.initial_closure.named_coefficients()[name].item()
         assert line(ax, "start").get_ydata()[0] == start
+        assert ax.get_yscale() == "log" and ax.get_title(loc="left").splitlines()[0].endswith("]")
         assert ax.get_title(loc="right") == f"{100 * (found[-1] / TRUE[name] - 1):+.2g} %"
 
 
@@ -333,16 +390,23 @@ def drone() -> Snapshot:
 
 def test_collectors_path_is_the_record(drone):
     figure = drone_figures.flight_path(drone)
-    captions = ("vertical plane", drone.plant.inputs[0].label, "distance to the target [m]")
-    path, wind, distance = (panel(figure, caption) for caption in captions)
-    for name, states in (("real", drone.record.states), ("twin", drone.replay)):
+    plant, real = drone.plant, drone.record.states
+    path, wind, distance = (panel(figure, name) for name in ("vertical plane", *_side_labels(plant)))
+    for name, states in (("real", real), ("twin", drone.replay)):
         assert np.array_equal(line(path, name).get_xydata(), states[:, :2].numpy())
         away = torch.hypot(states[:, 0] - 5.0, states[:, 1] - 5.0)
         np.testing.assert_allclose(line(distance, name).get_ydata(), away.numpy(), rtol=1e-14)
     assert line(path, "target").get_xydata().tolist() == [[5.0, 5.0]]
+    assert (path.get_xlabel(), path.get_ylabel()) == (plant.states[0].label, plant.states[1].label)
+    assert path.get_aspect() == 1.0
     assert same(line(wind, "recorded"), drone.record.exogenous[:, 0])
     assert same(line(wind, "large scale (SVR)"), drone.large_scale[:, 0])
     assert 2.554 in [entry.get_ydata()[0] for entry in wind.lines]
+    assert distance.get_xlabel() == "time [s]"
+
+
+def _side_labels(plant):
+    return plant.inputs[0].label, "distance to the target [m]"
 
 
 def test_polars_are_those_of_the_closures(drone):
@@ -358,20 +422,26 @@ def test_polars_are_those_of_the_closures(drone):
         np.testing.assert_allclose(line(drag, name).get_ydata(), b + c * (1 - np.cos(2 * alpha)), atol=1e-13)
     assert "twin: a = 0.86, b = 0.05, c = 1.5" in figure._suptitle.get_text()
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert [ax.get_title(loc="left")[-3:] for ax in (lift, drag)] == ["[-]", "[-]"]
+    assert share.get_xlabel().endswith("[deg]")
 
 
 def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(drone):
     figure = drone_figures.control_surfaces(drone)
     contours = [ax for ax in figure.axes if ax.get_title(loc="left") in ("model-based", "model-free")]
+    assert len(contours) == 8
+    planes = {(ax.get_xlabel(), ax.get_ylabel()) for ax in contours if ax.get_ylabel()}
     e_x, e_z, de_x, de_z = (signal.label for signal in drone.plant.observations)
-    assert {(ax.get_xlabel(), ax.get_ylabel()) for ax in contours if ax.get_ylabel()} == {(e_x, de_x), (e_z, de_z)}
-    for number, ax in enumerate(contours):
-        k = number % 4 // 2
+    assert planes == {(e_x, de_x), (e_z, de_z)}
+    for ax in contours:
+        k = contours.index(ax) % 4 // 2
         policy = drone.policies[ax.get_title(loc="left").replace("-", "_")]
         filled, observation = ax.collections[0], torch.zeros(4, dtype=torch.float64)
+        plane = [0, 2] if ax.get_xlabel() == e_x else [1, 3]
         corner = [ax.get_xlim()[0], ax.get_ylim()[1]]
-        observation[[0, 2] if ax.get_xlabel() == e_x else [1, 3]] = torch.tensor(corner, dtype=torch.float64)
-        level = np.searchsorted(filled.levels, policy(observation)[k].item()) - 1
+        observation[plane] = torch.tensor(corner, dtype=torch.float64)
+        value = policy(observation)[k].item()
+        level = np.searchsorted(filled.levels, value) - 1
         # The corner is a vertex of the band that holds its value.
         distance = np.linalg.norm(filled.get_paths()[level].vertices - corner, axis=1)
         assert distance.min() < 1e-9

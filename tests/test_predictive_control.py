@@ -8,6 +8,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from printed_commands import blocks
+from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import drawn, seeded
 
@@ -16,7 +17,7 @@ from rt_torchrl.control.command_cost import PENALTY, CommandCost, descend
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.plants.signal import bounds
+from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.twin import constant
@@ -28,9 +29,18 @@ def control(plant=PLANT, closure=None, **options):
     return PredictiveControl(plant, closure or plant.closure, PredictiveConfig(horizon=1.0, **options))
 
 
-def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode():
-    for dt, horizon, hold, expected in (0.05, 10.0, None, 1.0), (0.1, 2.0, None, 0.5), (0.1, 5.0, 0.5, 1.0):
-        assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
+@pytest.mark.parametrize(
+    ("dt", "horizon", "hold", "expected"),
+    [
+        (0.05, 10.0, None, 1.0),
+        (10.0, 1200.0, None, 200.0),
+        (0.1, 2.0, None, 0.5),
+        (0.1, 5.0, 0.5, 1.0),
+        (1.0, 2.0, None, 1.0),
+    ],
+)
+def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episode(dt, horizon, hold, expected):
+    assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
 
 
 def on_the_real_system(controller, env, *, strength=0.0):
@@ -90,18 +100,39 @@ def test_model_predictive_control_that_nobody_set_suits_any_plant(plant):
     assert unseen.control_costs(controller).mean() < costs.mean()
 
 
+class Movable(LinearQuadratic):
+    """A plant that is to be held at a place, which its user may move."""
+
+    def __init__(self):
+        super().__init__(horizon=2.0, noise=0.0)
+        self.register_buffer("target", torch.zeros(1, dtype=torch.float64))
+
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(
+            t, torch.cat([state[..., :1] - self.target, state[..., 1:]], -1), applied, exogenous
+        )
+
+
+def test_it_flies_to_a_target_that_has_moved():
+    plant = Movable()
+    start, inputs = torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)
+    controller = control(plant)
+    still = controller.fly(start, inputs).states[0, -1, 0].item()
+    plant.target.fill_(0.7)
+    moved, anew = (each.fly(start, inputs).states for each in (controller, control(plant)))
+    torch.testing.assert_close(moved, anew, rtol=1e-9, atol=1e-12)
+    assert abs(still) < 1e-6 and moved[0, -1, 0] > 0.2
+
+
 def test_it_plans_on_the_closure_as_it_is_trained():
     """With the true closure it costs less than with a wrong one, and a copy keeps the closure that it has."""
     closure = LinearClosure(torch.tensor([[0.0, 0.0], [6.0, 0.0]]))
     controller, (state, exogenous) = control(closure=closure), drawn(PLANT, 4, 1)
     wrong, kept = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean(), copy.deepcopy(controller)
-    before = controller.act(0.0, state[:1], exogenous[:1, 0])
     with torch.no_grad():
         closure.matrix.copy_(PLANT.closure.matrix)
     right = control_cost(PLANT, controller.fly(state, exogenous, PLANT.closure)).mean()
     assert right < 0.95 * wrong
-    controller.begin()
-    assert not torch.allclose(controller.act(0.0, state[:1], exogenous[:1, 0]), before, atol=1e-2)
     torch.testing.assert_close(control_cost(PLANT, kept.fly(state, exogenous, PLANT.closure)).mean(), wrong)
     assert {name for name, _ in controller.named_parameters()} == {"closure.matrix"}
 
@@ -240,6 +271,22 @@ def test_the_code_of_the_page_prints_what_its_table_says(horizon, capsys):
     assert costs[1] < costs[0] and (horizon < 600.0 or costs[1] == pytest.approx(0.01182, abs=1e-5))
 
 
+def test_a_long_horizon_is_the_linear_quadratic_regulator():
+    plant = LinearQuadratic(horizon=3.0, noise=0.0)
+    A, B, _, Q, R = matrices(plant)
+    P = solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    config = PredictiveConfig(horizon=8.0, tolerance=0.0, iterations=500)
+    controller = RecedingHorizon(plant, plant.closure, config)
+    state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
+    flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
+    s = state.numpy().T
+    for k in range(plant.n_steps):
+        np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
+        s = A @ s - B @ K @ s
+    assert len(controller.solves) == 2 * plant.n_steps
+
+
 # The cost of held commands, its gradient and its descent beside rollouts and a bounded least-squares problem.
 
 
@@ -278,6 +325,13 @@ def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
         wanted = by_rollout(plant, plan, state, exogenous, hold=hold, start=start)
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
+
+
+def test_a_cost_without_finite_ranges_is_refused():
+    plant = LinearQuadratic()
+    plant.actions = (Signal(symbol="a", name="force", unit="N"),)
+    with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
+        CommandCost(plant, plant.closure, 10)
 
 
 def test_a_descent_goes_round_points_where_the_cost_is_not_finite():

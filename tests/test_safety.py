@@ -3,14 +3,13 @@
 import json
 import math
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -119,6 +118,7 @@ SPIKE = {"value": 7.0, "ranges": {"observation": ((-5.0, -50.0), (5.0, 50.0))}}
 @pytest.mark.parametrize(
     ("options", "asked", "expected", "counts"),
     [
+        ({"broken": [4]}, [0.5] * 20, [0.5] * 5 + [-1.0] + [0.5] * 14, {"not finite": 1, "fallback": 1}),
         ({"broken": [3], **SPIKE}, [0.5] * 20, [0.5] * 4 + [-1.0] + [0.5] * 15, {"out of range": 1, "fallback": 1}),
         ({"late": [6], "deadline": 0.2}, [0.5] * 20, [0.5] * 7 + [-1.0] + [0.5] * 12, {"late": 1, "fallback": 1}),
         ({}, [0.5] * 3 + [math.nan] + [0.5] * 16, [0.5] * 3 + [-1.0] + [0.5] * 16, {"asked": 1, "fallback": 1}),
@@ -184,6 +184,10 @@ def test_specs_hold_around_both_kinds_of_systems():
 def test_what_the_layer_does_not_have_is_the_systems():
     env = layer()
     assert isinstance(env.plant, LinearQuadratic) and env.closure is env.plant.closure
+    state = env.state_dict()
+    first = env.reset()["state"]
+    env.load_state_dict(state)
+    assert torch.equal(env.reset()["state"], first)
     with pytest.raises(AttributeError, match="nonsense"):
         _ = env.nonsense
 
@@ -200,6 +204,9 @@ def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_o
 
 
 def test_what_cannot_be_guarded_is_refused():
+    unlimited = Unbounded(shape=(1,), dtype=torch.float64)
+    with pytest.raises(ValueError, match="low=.inf"):
+        ActionLimits(unlimited, SafetyConfig(interval=DT, low=(float("inf"),)))
     with pytest.raises(ValueError, match="fallback gave"):
         fly(failing(broken=[1], fallback=lambda found: torch.full((1, 1), torch.nan)), [0.0] * 20)
     pytest.importorskip("gymnasium")
@@ -210,12 +217,20 @@ def test_what_cannot_be_guarded_is_refused():
 # Closing what stands around a machine closes the machine, once.
 
 
+class Machine(PlantEnv):
+    closed = 0
+
+    def close(self, **kwargs):
+        self.closed += 1
+        super().close(**kwargs)
+
+
 def test_a_real_system_behind_a_safety_layer_is_closed():
     plant = LinearQuadratic(horizon=2.0)
-    machine = PlantEnv(plant)
-    machine.close = Mock(wraps=machine.close)
-    guarded = layer(machine)
-    system = RealSystem(guarded, plant, **{name: Reading(keys=(name,)) for name in ("state", "exogenous", "applied")})
-    assert not machine.close.called
+    machine = Machine(plant)
+    layer = SafetyLayer(machine, SafetyConfig(interval=plant.dt), fallback=(0.0,))
+    entries = {"state": Reading(keys=("state",)), "exogenous": Reading(keys=("exogenous",))}
+    system = RealSystem(layer, plant, **entries, applied=Reading(keys=("applied",)))
+    assert machine.closed == 0
     system.close()
-    assert machine.close.call_count == 1 and guarded.is_closed and system.is_closed
+    assert machine.closed == 1 and layer.is_closed and system.is_closed

@@ -16,6 +16,7 @@ from rt_torchrl.envs.wind_turbine import plant as module
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
+from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.plant import PaperCost, WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
@@ -44,6 +45,10 @@ def torque(c_p, omega, beta, u):
     return 0.5 * RHO * math.pi * R**2 * c_p(omega * R / u, beta) * u**3 / omega
 
 
+def steady(u):
+    return KaimalWind(mean=u, intensity=0.0)
+
+
 def start(plant, omega, *, u, command=(0.0, 0.0)):
     """A state with settled filters and the actuators at the command."""
     return torch.tensor([[omega, N_G * omega, u, 0.0, *command]], dtype=torch.float64)
@@ -64,12 +69,13 @@ def test_time_constant_of_the_drivetrain(c_p):
     slope = (torque(c_p, OMEGA_RATED + h, 0.0, 11.4) - torque(c_p, OMEGA_RATED - h, 0.0, 11.4)) / (2 * h)
     # Central difference of a spline: h² of its curvature, and rounding 1e-16/1e-5.
     assert found == pytest.approx(-J / slope, rel=1e-6)
+    assert found == pytest.approx(16.5, rel=0.05)  # the expected figure, from the published inertia, to two digits
 
 
-@pytest.mark.parametrize("u, beta, tau_g", [(12.0, 5.0, 30e3), (15.0, 11.0, 40e3)])
-def test_settles_where_the_torques_balance(c_p, u, beta, tau_g):
-    root = brentq(lambda omega: torque(c_p, omega, beta, u) - N_G * tau_g, 0.9, 2.0, xtol=1e-12)
-    plant = WindTurbine(horizon=1200.0)
+@pytest.mark.parametrize("u, beta, tau_g, bracket", [(12.0, 5.0, 30e3, (0.9, 2.0)), (15.0, 11.0, 40e3, (0.9, 2.0))])
+def test_settles_where_the_torques_balance(c_p, u, beta, tau_g, bracket):
+    root = brentq(lambda omega: torque(c_p, omega, beta, u) - N_G * tau_g, *bracket, xtol=1e-12)
+    plant = WindTurbine(horizon=1200.0, wind=steady(u))
     end = fly(plant, start(plant, 1.05 * root, u=u, command=(tau_g, beta)), u, (tau_g, beta))[-1]
     # 1200 s are above 40 time constants there; what is left is the agreement of the splines, 1e-11.
     assert end[0].item() == pytest.approx(root, rel=1e-8)
@@ -77,14 +83,18 @@ def test_settles_where_the_torques_balance(c_p, u, beta, tau_g):
 
 
 def test_optimal_gain_takes_the_greatest_power(c_p):
-    """At λ* the law K ω_g² draws ½ρπR²C_p,max u³."""
-    plant, u = WindTurbine(), 8.0
+    """At λ* the law K ω_g² draws ½ρπR²C_p,max u³, and the rotor keeps its speed."""
+    plant, u = WindTurbine(wind=steady(8.0)), 8.0
     lam = np.linspace(7.0, 8.2, 12_001)
     powers = np.array([c_p(x, 0.0) for x in lam])
     best, lam_best = powers.max(), lam[powers.argmax()]
     omega_g = N_G * lam_best * u / R
     # Grid spacing 1e-4 in λ: 1e-4/7.6 in λ³ three times over.
     assert plant.optimal_gain * omega_g**3 == pytest.approx(0.5 * RHO * math.pi * R**2 * best * u**3, rel=1e-4)
+    command = (plant.optimal_gain * omega_g**2, 0.0)
+    end = fly(plant, start(plant, omega_g / N_G, u=u, command=command), u, command)[-1]
+    # The same 1e-4 in torque, over the slope of the balance, ∂ln τ/∂ln ω = −1 at the optimum.
+    assert end[0].item() == pytest.approx(omega_g / N_G, rel=3e-4)
 
 
 @pytest.mark.parametrize(
@@ -240,12 +250,16 @@ def test_mean_power_its_deviation_and_top_speed(controller):
 
 def test_the_torque_joins_its_regions_continuously(controller):
     calm = torch.zeros(2, dtype=torch.float64)
-    for region in ("cut_in", "square", "slip", "constant_power"):
-        speed = getattr(controller, f"{region}_speed")
-        below, above = controller.torque(double(speed - 1e-7, speed + 1e-7), calm)
+    for speed in (
+        controller.cut_in_speed,
+        controller.square_speed,
+        controller.slip_speed,
+        controller.constant_power_speed,
+    ):
+        below, above = controller.torque(torch.tensor([speed - 1e-7, speed + 1e-7], dtype=torch.float64), calm)
         # The steepest region has 3e3 N m per rad/s; 2e-7 rad/s are 1e-3 N m.
         assert abs(above - below) < 1e-2
-    assert controller.torque(double(60.0, 60.0), calm).tolist() == [0.0, 0.0]
+    assert controller.torque(torch.tensor([60.0, 60.0], dtype=torch.float64), calm).tolist() == [0.0, 0.0]
 
 
 def test_the_pitch_is_the_scheduled_pi_law_by_hand(controller):
@@ -386,3 +400,13 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     other = unseen.fly(Held())
     assert torch.equal(other.exogenous, found.exogenous)
     assert torch.equal(other.states[:, 0, 0], found.states[:, 0, 0])
+
+
+def test_a_steady_wind_above_rated_is_held_at_rated_speed(controller):
+    plant = controller.plant
+    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
+    flown = controller.fly(state, torch.full((1, 600, 1), 16.0, dtype=torch.float64))
+    # The integral leaves no error; 300 s are eighteen time constants of the rotor.
+    assert plant.gear_ratio * flown.states[0, -1, 0].item() == pytest.approx(controller.reference_speed, rel=1e-3)
+    power = plant.generator_power(flown.states[:, -2], flown.actions[:, -1]).item()
+    assert power == pytest.approx(controller.power, rel=1e-3)
