@@ -16,6 +16,7 @@ from rt_torchrl.envs.flapping_wing import unknown as flapping_wing
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine import unknown as wind_turbine
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.systems.environment import AroundSystem
@@ -333,6 +334,12 @@ def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():
     system, other = wired(PENDULUM), wired(PENDULUM)
     rt.check_real_system(system, PENDULUM)
     assert torch.equal(system.reset()["state"], other.reset()["state"])
+
+
+def test_the_controller_that_flies_first_may_act():
+    found = rt.check_real_system(wired(TURBINE, order=SWAPPED), TURBINE, policy=JonkmanController(TURBINE))
+    assert "are in the other order" in found.mistakes[0].mistake
+    rt.check_real_system(wired(TURBINE), TURBINE, policy=JonkmanController(TURBINE)).require()
 
 
 def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_learns(tmp_path):
