@@ -12,7 +12,6 @@ if __name__ == "__main__":
 from tyro.conf import Positional
 
 from rt_torchrl.atomic_file import make_folder
-from rt_torchrl.export.program import require_onnx
 from rt_torchrl.options import Text
 
 FORMATS: dict[str, dict[str, Callable[..., float | None]]] = {
@@ -75,10 +74,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    formats = config.formats or DEFAULT
-    if "onnx" in formats:
-        others = " ".join(kind for kind in formats if kind != "onnx") or " ".join(DEFAULT)
-        require_onnx(f"leave it out by --formats {others}")
+    # ONNX is the last one, because its packages may be missing.
+    formats = sorted(config.formats or DEFAULT, key="onnx".__eq__)
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):
@@ -91,8 +88,8 @@ def main(config: Config) -> None:
         )
     output = config.output or config.run / "exported"
     make_folder("output", output)
-    for what in config.what:
-        for kind in formats:
+    for kind in formats:
+        for what in config.what:
             if kind in FORMATS[what]:
                 print(written(config, run, output, what, kind))
 

@@ -139,11 +139,8 @@ def interface(plant: Plant) -> dict[str, Any]:
     }
 
 
-def require_onnx(otherwise: str = "take the .pt2 program or C") -> None:
+def require_onnx() -> None:
     """Refuse to go on without the packages of the extra ``export``.
-
-    Args:
-        otherwise: what can be done without them.
 
     Raises:
         ValueError: if a package is not installed.
@@ -154,7 +151,7 @@ def require_onnx(otherwise: str = "take the .pt2 program or C") -> None:
         except ImportError as error:
             raise ValueError(
                 f"ONNX needs the package {package}: install the extra, uv run --extra export or pip install "
-                f"'rt_torchrl[export]'; or {otherwise}."
+                "'rt_torchrl[export]'; or take the .pt2 program or C."
             ) from error
 
 
