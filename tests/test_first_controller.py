@@ -154,6 +154,21 @@ def test_a_run_begins_with_its_first_controller_once_and_knows_it_when_it_is_res
     assert summary["first"] == metrics["summary"]["first"] and summary["unseen"]["costs"] == unseen["costs"]
 
 
+def test_a_run_is_not_resumed_with_another_controller_whose_flights_it_lacks(tmp_path, monkeypatch):
+    def resume(first, **parts):
+        small_run(tmp_path, 2, parts={"first": first, **parts}, resume=True)
+
+    small_run(tmp_path, 1, parts={"first": PD}).train()
+    with pytest.raises(ValueError, match="classical controller.*first.class is Quick here and was PD in the run"):
+        resume(type("Quick", (PD,), {}))
+    monkeypatch.setattr(PD, "default_gains", (0.3, 0.6))
+    message = r"first.K_2 is \[0.6\] here and was \[0.3\] in the run. Its flights .*a new run by --start"
+    with pytest.raises(ValueError, match=message):
+        resume(PD)
+    monkeypatch.undo()
+    small_run(tmp_path, 1, parts={"first": PD, "baselines": {"new": PD}}, resume=True).train()
+
+
 def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
     with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
         small_run(tmp_path / "run", start="controller")

@@ -28,6 +28,7 @@ from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
+from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
 from rt_torchrl.steps.plan import MakePlanner, make_planner
@@ -113,7 +114,10 @@ class Run:
         self._start = start_of(self.config, physics, first)
         if threads := real_side.learner_threads(config):
             torch.set_num_threads(threads)
-        self._held = RunFolder(config, plant.name)
+        controllers = {name: law(physics) for name, law in laws.items()}
+        flies_first = first if begins == "controller" else None
+        named = {"first" if laws[name] is flies_first else name: law for name, law in controllers.items()}
+        self._held = RunFolder(config, plant.name, {name: numbers_of(law) for name, law in named.items()})
         self.folder = self._held.path
         try:
             if real is None:
@@ -123,7 +127,6 @@ class Run:
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector, device=device)
             self.unseen = real_side.judged_on(plant, self.algorithm.twin, real, self.config, device=device)
             self._real, self._device = real, device
-            controllers = {name: law(physics) for name, law in laws.items()}
             self.baselines = {name: law.to(device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []

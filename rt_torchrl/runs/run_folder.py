@@ -236,14 +236,15 @@ class RunFolder:
     Args:
         config: options of the run.
         plant: name of the run's plant.
+        controllers: numbers of its classical controllers, by their names.
 
     Raises:
         ValueError: if the folder cannot be written or is in use; if it holds a run and ``resume`` is not asked for; if
-            it is to be resumed and holds no run with these options.
+            it is to be resumed and holds no run with these options and controllers.
     """
 
-    def __init__(self, config: RunConfig, plant: str):
-        self._config, self._plant = config, plant
+    def __init__(self, config: RunConfig, plant: str, controllers: Mapping[str, Any] | None = None):
+        self._config, self._plant, self._controllers = config, plant, controllers or {}
         self.path = self._make_path()
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
@@ -291,7 +292,7 @@ class RunFolder:
             return
         if not self.holds_run():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
-        require_same(self.path, self._config)
+        require_same(self.path, self._config, self._controllers)
         if not checkpoints(self.path) and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(
                 f"log_dir={self.path} holds a finished run without a checkpoint: there is nothing to go on with. {ANEW}"
@@ -317,4 +318,4 @@ class RunFolder:
         Raises:
             OSError: if the folder cannot be written.
         """
-        write_settings(self.path, self._config, effective, self._plant)
+        write_settings(self.path, self._config, effective, self._plant, self._controllers)

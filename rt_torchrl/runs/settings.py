@@ -5,24 +5,32 @@ import functools
 import importlib
 import importlib.metadata
 import importlib.util
+import inspect
 import json
 import platform
 import shlex
 import sys
 import time
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+from torch import nn
+
 import rt_torchrl
 from rt_torchrl.atomic_file import read_json, write_atomically
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.run_config import RunConfig
 
 FILE = "config.json"
 RAN = "ran"
 """Key of the list with an entry for every start of the run."""
-BESIDE = ("plant", "recipe", RAN)
+CONTROLLERS = "controllers"
+"""Key of the numbers of the classical controllers, by their names."""
+BESIDE = ("plant", "recipe", CONTROLLERS, RAN)
 """Keys of ``config.json`` that are not options."""
 OWN_CLASS: dict[str, str | None] = {"class": "RunConfig", "file": None}
 """What a run with the configuration of this library itself names in the place of a recipe."""
@@ -124,7 +132,21 @@ HARMLESS = {*BESIDE_TRAINING, "episodes", "unseen_every", "real_unseen"}
 ABSENT = "nothing"
 
 
-def write_settings(folder: Path, config: RunConfig, effective: RunConfig, plant: str) -> None:
+def numbers_of(law: nn.Module) -> dict[str, Any]:
+    """Class, gains, tensors and other numbers of a classical controller, to six digits: machines round differently."""
+    gains = dict(zip(law.gain_units, law.gains, strict=True)) if isinstance(law, ClassicalController) else {}
+    own, tensors = {"log_gains", "low_action", "high_action"}, [*law.named_parameters(), *law.named_buffers()]
+    kept = {name: x for name, x in tensors if name not in own and not name.startswith("plant.")}
+    values = {name: inspect.getattr_static(law, name, None) for name in dir(law) if not name.startswith("_")}
+    scalars = {name: torch.tensor(x) for name, x in values.items() if type(x) in (int, float)}
+    entries = (scalars | kept | gains).items()
+    numbers = {name: [float(f"{number:.6g}") for number in x.flatten().tolist()] for name, x in entries}
+    return {"class": type(law).__name__} | numbers
+
+
+def write_settings(
+    folder: Path, config: RunConfig, effective: RunConfig, plant: str, controllers: Mapping[str, Any]
+) -> None:
     """Write ``config.json``: the settings of the run, and ``ran`` with an entry for every start of the run.
 
     Args:
@@ -132,6 +154,7 @@ def write_settings(folder: Path, config: RunConfig, effective: RunConfig, plant:
         config: options as they were asked for.
         effective: options that the run carries out.
         plant: name of the plant.
+        controllers: :func:`numbers_of` each classical controller, by its name.
 
     Raises:
         OSError: if the file cannot be written.
@@ -143,7 +166,7 @@ def write_settings(folder: Path, config: RunConfig, effective: RunConfig, plant:
         "command": shlex.join(sys.argv),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    settings = settings_of(config, plant) | {RAN: [*before, ran]}
+    settings = settings_of(config, plant) | {CONTROLLERS: controllers, RAN: [*before, ran]}
     # Options may be infinite; JSON as Python writes it keeps them as they are.
     write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
 
@@ -159,14 +182,23 @@ def as_written(config: RunConfig) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
-def require_same(folder: Path, config: RunConfig) -> None:
+def require_same(folder: Path, config: RunConfig, controllers: Mapping[str, Any]) -> None:
     """Refuse to go on with a run under options that differ from its own, except for harmless ones.
+
+    Nor may a classical controller have other numbers than in the run: its flights tell nothing of another one.
 
     ``unseen`` is harmless too if the run has not judged any training episode on the unseen episodes.
 
     Raises:
-        ValueError: if an option differs; it names each such option with both values.
+        ValueError: if an option or a controller differs; it names what does, with both values.
     """
+    earlier: dict[str, Any] = read_settings(folder).get(CONTROLLERS, {})
+    if changed := changes(earlier, controllers, earlier.keys() ^ controllers.keys()):
+        raise ValueError(
+            f"log_dir={folder} is to be resumed with another classical controller than its own: {'; '.join(changed)}. "
+            f"Its flights tell nothing of this one: give it what it was in the run, or begin a new run by --start "
+            f"{folder}, which takes policies and twin of the run, when it is finished, without its flights."
+        )
     judged = flat(read_settings(folder)).get("unseen_every")
     if changed := differences(folder, config, HARMLESS if judged else HARMLESS | {"unseen"}):
         raise ValueError(
@@ -186,19 +218,18 @@ def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str] = HA
     Raises:
         ValueError: if the folder is not a run folder, or its settings are damaged.
     """
-    earlier = flat(read_settings(folder))
-    present = flat(as_written(config))
-    sentences = []
-    for name in sorted(earlier.keys() | present.keys()):
-        if name.split(".")[0] in {*harmless, *BESIDE}:
-            continue
-        was, now = earlier.get(name, ABSENT), present.get(name, ABSENT)
-        if was != now:
-            sentences.append(f"{name} is {now} here and was {was} in the run")
-    return sentences
+    return changes(read_settings(folder), as_written(config), {*harmless, *BESIDE})
 
 
-def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def changes(earlier: Mapping[str, Any], present: Mapping[str, Any], but: AbstractSet[str] = frozenset()) -> list[str]:
+    """What differs between two settings, in words, but those of some names."""
+    was, now = (flat({k: v for k, v in one.items() if k not in but}) for one in (earlier, present))
+    names = sorted(was.keys() | now.keys())
+    pairs = [(name, now.get(name, ABSENT), was.get(name, ABSENT)) for name in names]
+    return [f"{name} is {here} here and was {there} in the run" for name, here, there in pairs if here != there]
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested options by their dotted names, as the command line has them."""
     options: dict[str, Any] = {}
     for name, value in settings.items():
