@@ -3,6 +3,7 @@
 import math
 from functools import partial
 
+import numpy as np
 import pytest
 import test_extensions as extensions
 import torch
@@ -21,6 +22,8 @@ from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveCo
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import Answer
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
+from rt_torchrl.fit.log import SensorLog
+from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.config import SafetyConfig
@@ -238,6 +241,16 @@ def test_past_observations_follow_from_a_log():
     assert torch.equal(found[0, 2:], observed(plant, states[None], exogenous[:1])[0, 0, 2:])
     before = plant.observe(torch.tensor(-1.0).double(), states[5], exogenous[0, 5])  # of a log that counts down to zero
     assert torch.equal(before[2:], states[5, 2:])
+
+
+def test_past_observations_of_a_log_that_begins_later_know_the_time():
+    plant, rows = rt.StackedObservations(Timed(), 3), np.linspace(0.0, 1.0, 13)
+    signals = (*LinearQuadratic.states, *plant.actions, *plant.inputs)
+    log = SensorLog(times=5.0 + plant.dt * np.arange(13), columns={signal.name: rows for signal in signals})
+    (segment,) = resample(log, plant).segments
+    t = 5.0 + plant.dt * torch.arange(12, dtype=torch.float64)
+    seen = plant.base.observe(t, plant.split(segment.states[:-1])[0], segment.exogenous)
+    torch.testing.assert_close(plant.split(segment.states)[1][1:, : seen.shape[-1]], seen, rtol=1e-14, atol=1e-14)
 
 
 def test_a_real_system_that_reports_the_states_of_the_plant_alone():

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.log import Rows, SensorLog, logged_states
+from rt_torchrl.fit.log import TIME, Rows, SensorLog, logged_states
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, known_sensors, sensors_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -150,7 +150,7 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
         return torch.from_numpy(values)
 
     actions, exogenous = held(plant.actions), plant.with_previews(held(plant.acting_inputs)[None])[0]
-    measured = {}
+    measured = {TIME: torch.from_numpy(grid)}
     for state in logged_states(plant):
         if state.name in log.columns:
             values = _unwrapped(state, log.columns[state.name][rows])

@@ -313,7 +313,7 @@ class Plant(nn.Module):
         A plant overrides this method if some states have no sensor but follow from the others, such as filters.
 
         Args:
-            measured: states that were logged, by name.
+            measured: states that were logged, by name, and the ``time`` of the samples.
             exogenous, actions: inputs and applied actions of the n intervals between the samples.
 
         Raises:

@@ -190,10 +190,11 @@ class StackedObservations(Extension):
         return self.joined(self.base.at_rest(readings[..., : self._read]), readings[..., self._read :])
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """States of the plant from a log, and the observations that follow from them; t is 0 at its first sample."""
+        """States of the plant from a log, and the observations that follow from them."""
         base = self.base.complete_states(measured, exogenous, actions)
         samples = torch.arange(len(base), device=base.device)
-        observations = self.base.observe(self.dt * samples[:-1].to(base), base[:-1], exogenous)
+        t = measured.get("time", self.dt * samples.to(base))
+        observations = self.base.observe(t[:-1], base[:-1], exogenous)
         before = samples.unsqueeze(-1) - torch.arange(1, self.count + 1, device=base.device)
         return self.joined(base, observations[before.clamp(min=0)].flatten(-2))
 
