@@ -15,7 +15,7 @@ the steps:
 | ``weight_changes/model_free``, ``/model_based`` | relative change ‖Δw‖/‖w‖ | 2, 5 | 6 |
 | ``large_scale`` | n × n_z, units of the inputs | 3 | 4, 5 |
 | ``J_p_before``, ``J_p`` | cost of the twin on the records | 4 | 5 |
-| ``J_a_plan_before``, ``J_a_plan`` | mean expected cost on the virtual episodes of the plan | 5 | |
+| ``J_a_plan_before``, ``J_a_plan`` | mean J_a on the twin, in the virtual episodes that judge plans | 5 | |
 | ``event`` | keep, swap or clone | 6 | |
 | ``J_a_model_based``, ``J_a_model_free`` | mean J_a on the twin | 6 | |
 | ``seconds/STEP`` | wall time [s] | the algorithm | |

@@ -283,6 +283,8 @@ def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
     report = planning.plan(1, planned_on, rt.Scenario(starts, still))
     assert [len(starts) for starts in planner.seen] == [3, 8] and planner.seen[1][3] == 0.9
     assert planner.policy.gain.tolist() == STRONG and report["plan_accepted"] == 1.0
+    # What the plan costs is said of the episodes that judge, not of the dear ones that it was made on.
+    assert report["J_a_plan"].item() == virtual.cost(planner.policy, rt.Scenario(starts, still))
 
 
 def test_an_end_where_the_plant_has_none_is_refused():

@@ -282,7 +282,8 @@ class MultiStart:
             best = Plan(*flown, metrics(plan_accepted=0.0, recalled=1.0))
             policy.load_state_dict(best.weights)
             self.planner.restart()
-        return best.report
+        # Of episodes that plans were not made on: those of a plan that was made again are dear.
+        return best.report.update(metrics(J_a_plan_before=before.on_twin, J_a_plan=best.cost.on_twin))
 
     def _best(
         self, best: Plan, others: Iterable[tuple[int, Weights]], planned_on: Scenario, judged_on: Scenario
