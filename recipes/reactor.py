@@ -94,6 +94,8 @@ def real_system(plant: Reactor, *, seed: int = 0) -> "rt.RealSystem":
             start, course = plant.draw_initial_state(1, draws)[0], plant.draw_exogenous(1, draws)[0]
             course = np.vstack([course, course[-1:]])
             self.env_params["x0"] = np.append(start, course[0, 0])
+            # pcgym reports a set point an interval after its own reward takes it. Cost, twin and controllers here know
+            # the reported one alone, so that it merely changes an interval later than drawn.
             self.SP, self.disturbances = {"Ca": course[:, 0]}, {"Ti": course[:, 1]}
             return super().reset(seed=seed, **options)
 
