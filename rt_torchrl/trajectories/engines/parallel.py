@@ -22,8 +22,9 @@ from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.interval import Drive, GradientEngine, costate_products, march
 
-PIECE = 2048
-"""Greatest number of intervals that are differentiated at once, which bounds the memory."""
+PIECE, LARGE_PIECE = 2048, 2**17
+"""Greatest numbers of intervals that are differentiated at once, which bound the memory: on a CPU, and on other
+devices, where launching a kernel takes longer than its work on few rows."""
 
 
 class Parallel(GradientEngine):
@@ -73,7 +74,7 @@ def _products(
     The products are computed in pieces, because the tape of an interval holds every unit of a perceptron.
     """
     products = []
-    for states, *driven, costate in _pieces(PIECE, starts, drive, costates.flatten(0, 1)):
+    for states, *driven, costate in _pieces(1, starts, drive, costates.flatten(0, 1)):
         driving = [x.clone().requires_grad_() for x in driven]
         leaves = *driving, *weights
         with torch.enable_grad():
@@ -110,9 +111,10 @@ def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
     return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
 
 
-def _pieces(size: int, starts: Tensor, drive: Drive, *others: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """States, drive and other rows of the intervals of all realisations, in pieces of at most ``size`` rows."""
+def _pieces(each: int, starts: Tensor, drive: Drive, *others: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """States, drive and other rows of all intervals of all realisations in pieces; a row counts ``each`` times."""
     rows, driven = as_one_batch(starts, drive)
+    size = max(1, (PIECE if rows.device.type == "cpu" else LARGE_PIECE) // each)
     yield from zip(*(x.split(size) for x in (rows, *driven, *others)), strict=True)
 
 
@@ -124,7 +126,7 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
         starts: states at the starts of the intervals.
         drive: times and inputs of the intervals.
     """
-    values = [function(states, Drive(*driving)) for states, *driving in _pieces(PIECE, starts, drive)]
+    values = [function(states, Drive(*driving)) for states, *driving in _pieces(1, starts, drive)]
     return torch.cat(values).unflatten(0, starts.shape[:2])
 
 
@@ -132,7 +134,7 @@ def _jacobians(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
     """∂Φ/∂s at every interval, ``n batch n_s n_s``; an interval is computed once for each row of its Jacobian."""
     n_s, jacobians = starts.shape[-1], list[Tensor]()
     basis = torch.eye(n_s, dtype=starts.dtype, device=starts.device)
-    for piece in _pieces(max(1, PIECE // n_s), starts, drive):
+    for piece in _pieces(n_s, starts, drive):
         state, *driving = (x.repeat_interleave(n_s, 0) for x in piece)
         with torch.enable_grad():
             end = interval(state.requires_grad_(), Drive(*driving))
