@@ -15,10 +15,8 @@ from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from scipy.optimize import minimize
 
 from rt_torchrl import Comparison, compare_runs
-from rt_torchrl.atomic_file import finite
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.compare import FinishedRun, Row, comparison_figure, paired_ratio
-from rt_torchrl.runs.results import cost_of_learning
 from rt_torchrl.steps.interact import Interact
 
 TINY = Path(__file__).with_name("small_recipe.py")
@@ -41,8 +39,8 @@ def leave(folder, *, seed, costs, curve=(4.0, 2.0), arm="twinning", plant="tanks
         {"real_cost": 2.0 * cost if cost else cost, "J_a_unseen": cost, "seconds": {"plan": 1.5, "learn": 0.5}}
         for cost in curve
     ]
-    episodes[0] |= {"alarm": 1.0, "start_cost": 1.0}
-    summary = {"live": "model_based", "unseen": unseen, "cost_of_learning": finite(cost_of_learning(episodes))}
+    episodes[0]["alarm"] = 1.0
+    summary = {"live": "model_based", "unseen": unseen}
     (folder / "metrics.json").write_text(json.dumps({"plant": plant, "episodes": episodes, "summary": summary}))
     return folder
 
@@ -65,11 +63,11 @@ def test_every_number_of_a_table_is_that_by_hand(tmp_path):
     assert numbers["controllers"] == {"PI": 2.0}
     of_a, of_b = numbers["rows"]["a"], numbers["rows"]["b"]
     assert of_a["seeds"] == [0, 1, 2] and of_a["J_a"] == {"median": 2.0, "least": 1.0, "greatest": 3.0}
-    assert of_a["paid"] == {"median": 13.0, "least": 13.0, "greatest": 13.0}  # the start's 1 + 2 · (4 + 2)
+    assert of_a["paid"] == {"median": 12.0, "least": 12.0, "greatest": 12.0}  # 2 · (4 + 2)
     assert of_a["J_a_ratio"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
     assert of_a["episodes_to_optimum"] == {"median": math.inf, "least": math.inf, "greatest": math.inf}
     assert of_b["episodes_to_optimum"] == {"median": 2.0, "least": 2.0, "greatest": math.inf}
-    assert of_a["regret"]["median"] == 10.0  # beyond three episodes of the optimum
+    assert of_a["regret"]["median"] == 10.0  # beyond two episodes of the optimum
     assert of_a["alarms"]["median"] == 1.0 and of_a["seconds"]["median"] == 4.0
     assert of_a["merit"] == {"power [W]": 1.0}
     # Logarithms of the ratios are 0.1, 0.2, 0.3: mean 0.2, deviation 0.1, and t(0.975, 2) = 4.30265.
@@ -77,8 +75,8 @@ def test_every_number_of_a_table_is_that_by_hand(tmp_path):
     assert of_b["J_a_ratio"]["ratio"] == pytest.approx(math.exp(0.2))
     assert of_b["J_a_ratio"]["low"] == pytest.approx(math.exp(0.2 - half))
     assert of_b["J_a_ratio"]["high"] == pytest.approx(math.exp(0.2 + half))
-    paid = [1.0 + 2.0 * 7.0, 1.0 + 2.0 * 5.05, 1.0 + 2.0 * 5.05]
-    assert of_b["paid_ratio"]["ratio"] == pytest.approx(math.prod(cost / 13.0 for cost in paid) ** (1.0 / 3.0))
+    paid = [2.0 * 7.0, 2.0 * 5.05, 2.0 * 5.05]
+    assert of_b["paid_ratio"]["ratio"] == pytest.approx(math.prod(cost / 12.0 for cost in paid) ** (1.0 / 3.0))
 
 
 def cells(text):
@@ -91,7 +89,7 @@ def test_the_table_shows_these_numbers(tmp_path):
     first, second = ([FinishedRun.read(folder) for folder in group] for group in rows(tmp_path))
     comparison = Comparison("tanks", [Row(name="a", runs=first, optimum=1.0), Row(name="b", runs=second, optimum=1.0)])
     table = cells(comparison.table())
-    assert table["a"] == "a|3|2 (1 … 3)|+100 %|1.000|13|1.000|10|never|1|4".split("|")
+    assert table["a"] == "a|3|2 (1 … 3)|+100 %|1.000|12|1.000|10|never|1|4".split("|")
     assert table["b"][4] == "1.221 [0.953, 1.566]" and table["b"][8] == "2 (2 … never)"
     assert table["PI"][:3] == ["PI", "", "2"]
     assert "| PI | 5 |" in comparison.table() and "| a | 1 |" in comparison.table()  # the plant's own quantities
@@ -110,7 +108,7 @@ def test_ratios_are_those_of_common_seeds_with_positive_costs():
 
 def test_what_diverges_costs_infinitely(tmp_path):
     run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[1.0, NAN], curve=(NAN, 1.0)))
-    assert run.cost == math.inf and run.curve == [math.inf, 1.0] and run.paid == (math.inf, 3)
+    assert run.cost == math.inf and run.curve == [math.inf, 1.0] and sum(run.real) == math.inf
     for merits in itertools.permutations((1.0, math.nan, 3.0)):  # in whatever order the folders are given
         row = Row(name="a", runs=[dataclasses.replace(run, merit={"power [W]": merit}) for merit in merits])
         assert math.isnan(row.numbers(row)["merit"]["power [W]"])

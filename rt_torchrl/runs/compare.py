@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics
+from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics, real_costs
 from rt_torchrl.runs.settings import BESIDE, BESIDE_TRAINING, flat, read_settings, task_of
 from rt_torchrl.steps.config import Role
 
@@ -40,7 +40,7 @@ class FinishedRun:
         curve: mean J_a of the live policy on the unseen episodes after each real episode (``--unseen-every 1``), or
             J_a of the real episodes.
         judged: whether ``curve`` holds costs on unseen episodes.
-        paid: sum of J_a of all real episodes, and their number, as the run's own table has them.
+        real: J_a of each real episode.
         merit: mean of each of the plant's own quantities under that policy.
         controllers: mean J_a of each classical controller over the unseen episodes, and means of the plant's own
             quantities.
@@ -55,7 +55,7 @@ class FinishedRun:
     costs: list[float]
     curve: list[float]
     judged: bool
-    paid: tuple[float, int]
+    real: list[float]
     merit: dict[str, float]
     controllers: dict[str, tuple[float, dict[str, float]]]
     alarms: int
@@ -85,7 +85,6 @@ class FinishedRun:
         """
         settings, metrics = read_settings(folder), read_metrics(folder)
         summary, episodes = metrics["summary"], metrics["episodes"]
-        paid = summary["cost_of_learning"]
         unseen, live = judged_on_the_system(summary)
         judged = all("J_a_unseen" in episode for episode in episodes)
         return cls(
@@ -96,7 +95,7 @@ class FinishedRun:
             costs=_numbers(unseen["costs"][live]),
             curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
             judged=judged,
-            paid=(*_numbers([paid["sum"]]), paid["episodes"]),
+            real=_numbers(real_costs(episodes)),
             merit=_means(unseen["merit"][live]),
             controllers={
                 name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(baseline["merit"]))
@@ -129,14 +128,14 @@ class Row:
     @property
     def paid(self) -> dict[int, float]:
         """Sum of J_a of the real episodes, by seed."""
-        return {run.seed: run.paid[0] for run in self.runs}
+        return {run.seed: sum(run.real) for run in self.runs}
 
     @property
     def regret(self) -> list[float] | None:
         """What each run has paid beyond as many episodes of the optimum."""
         if self.optimum is None:
             return None
-        return [cost - count * self.optimum for cost, count in (run.paid for run in self.runs)]
+        return [sum(run.real) - len(run.real) * self.optimum for run in self.runs]
 
     @property
     def episodes_to_optimum(self) -> list[float] | None:

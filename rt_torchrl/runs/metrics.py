@@ -1,6 +1,6 @@
 """The file ``metrics.json`` of a run folder: how it is read, and what the policies of the run have cost where."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,11 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     if (live := summary.get("live")) not in ROLES:
         raise ValueError(f"{file} is damaged: summary names the live policy {live!r}; it must be {' or '.join(ROLES)}.")
     return metrics
+
+
+def real_costs(episodes: Sequence[Mapping[str, Any]]) -> list[float | None]:
+    """J_a of each real episode; windows that were taken together have their mean. None if it is not finite."""
+    return [entry["real_cost"] for entry in episodes for _ in range(int(entry.get("windows", 1)))]
 
 
 def on_the_twin(unseen: Mapping[str, Any]) -> bool:

@@ -19,7 +19,7 @@ from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin
+from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin, real_costs
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -206,9 +206,7 @@ def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | N
         judging: J_a of the flights on the real system after it, which count as well; None for one that is not finite.
     """
     costs = [record["start_cost"] for record in episodes if "start_cost" in record]
-    # Windows that were taken together have their mean.
-    real = [record["real_cost"] for record in episodes for _ in range(int(record.get("windows", 1)))]
-    costs += [torch.inf if cost is None else cost for cost in (*real, *judging)]
+    costs += [torch.inf if cost is None else cost for cost in (*real_costs(episodes), *judging)]
     paid = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
     return paid | ({"judging": list(judging)} if judging else {})
 
