@@ -305,11 +305,13 @@ def results_table(metrics: dict[str, Any]) -> str:
     )
     lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
-    lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
+    fitted = summary["twin"]
+    if fitted["note"] or not fitted["rms"]:  # a fit whose residuals are noise has answered the doubts of the first flight
+        lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
-    lines += fit_lines(summary["twin"])
-    lines += closure_lines(summary["closure"], summary["twin"]["standard_errors"])
-    lines += [f"  {note}" for note in [summary["twin"]["note"]] if note]
+    lines += fit_lines(fitted)
+    lines += closure_lines(summary["closure"], fitted["standard_errors"])
+    lines += [f"  {note}" for note in [fitted["note"]] if note]
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in summary["seconds"].items()))
     return "\n".join(lines)
 

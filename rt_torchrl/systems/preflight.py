@@ -134,7 +134,7 @@ class Wiring(NamedTuple):
         signals = zip(self.plant.states, self.moved.tolist(), *self.present[1:], strict=True)
         for signal, moved, unexplained, error in signals:
             share = f"{100.0 * unexplained:.3g} % unexplained" if math.isfinite(unexplained) else "it does not move"
-            rows.append(f"  {signal.name}: moves by {moved:.4g}, predicted to {error:.4g} {signal.unit}; {share}")
+            rows.append(f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted to {error:.4g}; {share}")
         for mistake in self.mistakes:
             shares = ", ".join(
                 f"{signal.name} {100.0 * share:.3g} %"
