@@ -113,9 +113,10 @@ def over_segments(
 ) -> R:
     """Fit whole records; those of an unstable twin over the longest segments that it follows as well as shorter ones.
 
-    Where the errors over whole records are not small enough, short segments are fitted from the same weights, and whole
-    records again from what these tell; the better of the two fits of whole records stays. If the twin is stable under
-    what short segments tell, it lacks something that no segment shows better, and whole records stay. Otherwise
+    Where the errors over whole records are not small enough, or the twin is unstable under the first weights, short
+    segments are fitted from the same weights, and whole records again from what these tell; the better of the two fits
+    of whole records stays. If the twin is stable under what short segments tell, it lacks something that no segment
+    shows better, and whole records stay. Otherwise errors are small enough that are near those of short segments, and
     segments of a third of the records are fitted, then of a ninth, and so on, from the same weights or, where the twin
     diverges over whole records under these, from what the short ones tell.
 
@@ -146,15 +147,18 @@ def over_segments(
 
     short = max(intervals // SHORT, 2)
     whole = explains(0, start)
-    if not whole and short < intervals:
+    closure.load_state_dict(start)
+    if short < intervals and (not whole or unstable()):
         first = fits.pop(0, None)
-        explains(short, start)
-        probed = fits.pop(short, None)
+        while short < intervals and not fits:  # the shortest segments may have too many first states
+            explains(short, start)
+            short *= SHORTENED
+        probed = fits.popitem()[1] if fits else None
         if probed is not None:
-            whole = explains(0, probed[2])
-            if not whole and 0 in fits:
-                closure.load_state_dict(probed[2])  # whole records bend the weights until nothing grows
-                whole = not unstable()
+            closure.load_state_dict(probed[2])  # whole records bend the weights until nothing grows
+            grows = unstable()
+            enough = torch.minimum(enough, DEPARTURE * probed[1]) if grows else enough
+            whole = explains(0, probed[2]) or (0 in fits and not grows)
             if first is None or not first[1].isfinite().all():
                 start = probed[2]
         if first is not None and (0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough)):
