@@ -43,6 +43,8 @@ LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
 EXPLAINED = 0.5
 """RMS error of a sensor, as a share of the scatter of its readings, below which a twin explains them."""
+SURE = 0.02
+"""Share of these errors below which whole records are explained, even if the twin is unstable."""
 SHORT = 60
 """Number of short segments of a record, which tell whether a twin is unstable."""
 GROWTH = 1e3
@@ -113,12 +115,12 @@ def over_segments(
 ) -> R:
     """Fit whole records; those of an unstable twin over the longest segments that it follows as well as shorter ones.
 
-    Where the errors over whole records are not small enough, or the twin is unstable under the first weights, short
-    segments are fitted from the same weights, and whole records again from what these tell; the better of the two fits
-    of whole records stays. If the twin is stable under what short segments tell, it lacks something that no segment
-    shows better, and whole records stay. Otherwise errors are small enough that are near those of short segments, and
-    segments of a third of the records are fitted, then of a ninth, and so on, from the same weights or, where the twin
-    diverges over whole records under these, from what the short ones tell.
+    Where the errors over whole records are not small enough, or not tiny and the twin is unstable under the first
+    weights, short segments are fitted from the same weights, and whole records again from what these tell; the better
+    of the two fits of whole records stays. If the twin is stable under what short segments tell, it lacks something
+    that no segment shows better, and whole records stay. Otherwise errors count as small enough where they are near
+    those of short segments, and segments of a third of the records are fitted, then of a ninth, and so on, from the
+    same weights or, where the twin diverges over whole records under these, from what the short ones tell.
 
     Args:
         closure: closure with the weights; those of the fit that is returned stay.
@@ -148,7 +150,7 @@ def over_segments(
     short = max(intervals // SHORT, 2)
     whole = explains(0, start)
     closure.load_state_dict(start)
-    if short < intervals and (not whole or unstable()):
+    if short < intervals and (not whole or ((fits[0][1] > SURE * enough).any() and unstable())):
         first = fits.pop(0, None)
         while short < intervals and not fits:  # the shortest segments may have too many first states
             explains(short, start)
