@@ -75,7 +75,7 @@ class Config:
 
 def main(config: Config) -> None:
     # ONNX is the last one, because its packages may be missing.
-    formats = sorted(config.formats or DEFAULT, key="onnx".__eq__)
+    formats = sorted(config.formats or DEFAULT, key=lambda kind: kind == "onnx")
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):

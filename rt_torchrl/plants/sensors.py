@@ -190,7 +190,7 @@ class StackedObservations(Extension):
         return self.joined(self.base.at_rest(readings[..., : self._read]), readings[..., self._read :])
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """States of the plant from a log, and the observations that follow from them."""
+        """States of the plant from a log, and the observations that follow; t begins with 0 where no time is given."""
         base = self.base.complete_states(measured, exogenous, actions)
         samples = torch.arange(len(base), device=base.device)
         t = measured.get("time", self.dt * samples.to(base))

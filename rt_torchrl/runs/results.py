@@ -306,9 +306,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
     fitted = summary["twin"]
-    if (
-        fitted["note"] or not fitted["rms"]
-    ):  # a fit whose residuals are noise has answered the doubts of the first flight
+    # A fit whose residuals are noise has answered the doubts of the first flight.
+    if fitted["note"] or not fitted["rms"]:
         lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
     lines += alarm_lines(metrics["episodes"])
     lines += fit_lines(fitted)

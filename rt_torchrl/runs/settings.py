@@ -192,14 +192,15 @@ def require_same(folder: Path, config: RunConfig, controllers: Mapping[str, Any]
     Raises:
         ValueError: if an option or a controller differs; it names what does, with both values.
     """
-    earlier: dict[str, Any] = read_settings(folder).get(CONTROLLERS, {})
+    settings = read_settings(folder)
+    earlier: dict[str, Any] = settings.get(CONTROLLERS, {})
     if changed := changes(earlier, controllers, earlier.keys() ^ controllers.keys()):
         raise ValueError(
             f"log_dir={folder} is to be resumed with another classical controller than its own: {'; '.join(changed)}. "
             f"Its flights tell nothing of this one: give it what it was in the run, or begin a new run by --start "
             f"{folder}, which takes policies and twin of the run, when it is finished, without its flights."
         )
-    judged = flat(read_settings(folder)).get("unseen_every")
+    judged = settings.get("unseen_every")
     if changed := differences(folder, config, HARMLESS if judged else HARMLESS | {"unseen"}):
         raise ValueError(
             f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(changed)}. Give the run's "
@@ -222,11 +223,10 @@ def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str] = HA
 
 
 def changes(earlier: Mapping[str, Any], present: Mapping[str, Any], but: AbstractSet[str] = frozenset()) -> list[str]:
-    """What differs between two settings, in words, but those of some names."""
-    was, now = (flat({k: v for k, v in one.items() if k not in but}) for one in (earlier, present))
-    names = sorted(was.keys() | now.keys())
-    pairs = [(name, now.get(name, ABSENT), was.get(name, ABSENT)) for name in names]
-    return [f"{name} is {here} here and was {there} in the run" for name, here, there in pairs if here != there]
+    """What differs between the settings of a run and the present ones, in words, except for some names."""
+    was, now = (flat({k: v for k, v in settings.items() if k not in but}) for settings in (earlier, present))
+    pairs = [(name, now.get(name, ABSENT), was.get(name, ABSENT)) for name in sorted(was.keys() | now.keys())]
+    return [f"{name} is {new} here and was {old} in the run" for name, new, old in pairs if new != old]
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
