@@ -17,8 +17,8 @@ and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`,
 whole episodes descend this one; updates, clones and the referee of step 6 compare it. Of weights that flew, their own n
 quiet flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
 episode refuted does not come back because policies like it were cheap. How well the episodes predict each other chooses
-σ and v. A twin that says of all these episodes what they cost, within 5 % and what exploration explains, is believed as
-it is.
+σ and v. A twin that says of all these episodes what they cost, within 5 % and what exploration and noise of the sensors
+(:mod:`~rt_torchrl.trajectories.sensor_noise`) explain, is believed as it is.
 """
 
 import contextlib
@@ -41,6 +41,7 @@ from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import metrics, same_architecture
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.sensor_noise import NoisySensors, noise_levels
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, whole_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -65,6 +66,8 @@ QUIET = 0.02
 """Exploration above which the cost of an episode says little about its policy."""
 ALARM = 0.15
 """Size of d of two episodes in a row, or half the size of d of one, from which the twin is called wrong."""
+NOISY_FLIGHTS = 16
+"""Number of flights that say what noise of the sensors changes in the cost of an episode."""
 
 
 class Flown(NamedTuple):
@@ -129,8 +132,10 @@ class Belief:
         """The latest episodes of the controller that flew first."""
         self._policy_flew = True
         self._costs: tuple[Any, list[float]] | None = None
+        self._noise: Tensor | None = None
+        self._by_noise = dict[int, tuple[float, float]]()
         self._anchored: tuple[Any, Anchors | None] | None = None
-        self._twins: dict[DigitalTwin, DigitalTwin] = {}
+        self._twins = dict[tuple[DigitalTwin, type[Anchored | NoisySensors]], DigitalTwin]()
         self._copies: dict[Role, nn.Module] = {}
         virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
 
@@ -227,23 +232,75 @@ class Belief:
                     costs.append(math.nan)
                 else:
                     costs.append(virtual.cost(self.policy_of(flown), virtual.repeated(flown.trajectory)))
-            self._costs = copy.deepcopy(twin), costs
+            self._costs, self._noise, self._by_noise = (copy.deepcopy(twin), costs), None, {}
         return self._costs[1]
+
+    def _beyond_noise(self, k: int) -> float:
+        """The paired difference of an episode beyond what noise of the sensors explains of a large one."""
+        d = self.differences()[k]
+        if math.isnan(d) or abs(d) <= NOISE:
+            return d
+        if k not in self._by_noise:
+            try:
+                self._by_noise[k] = self._explained_by_noise(self.flown[k])
+            except DivergenceError:
+                self._by_noise[k] = 0.0, 0.0
+        least, greatest = self._by_noise[k]
+        return d - min(max(d, least), greatest)
+
+    @torch.no_grad()
+    def _explained_by_noise(self, flown: Flown) -> tuple[float, float]:
+        """The least and the greatest paired difference of an episode that noise of the sensors explains.
+
+        They are two standard deviations from the mean of what flights of the twin cost with the noise over without it,
+        or zero.
+
+        Raises:
+            DivergenceError: if the twin diverges with the noise.
+        """
+        twin, (starts, inputs) = self.virtual.twin.believed, self.virtual.repeated(flown.trajectory)
+        if self._noise is None:
+            self._noise = noise_levels(twin, [latest.trajectory for latest in self.flown[-ANCHORS:]])
+        if not self._noise.any():
+            return 0.0, 0.0
+        noise = inputs.new_zeros(1 + NOISY_FLIGHTS, inputs.shape[1], len(self._noise))
+        noise[1:] = self._noise * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
+        flights = twin.plant.at_rest(starts).expand(len(noise), -1), inputs.expand(len(noise), -1, -1)
+        scenario = Scenario(flights[0], torch.cat([flights[1], noise], -1))
+        costs = self._twin_of(twin, NoisySensors).episode_costs(self.policy_of(flown), *scenario)
+        logs = (costs[1:] / costs[0]).log()
+        mean, spread = logs.mean().item(), 2.0 * logs.std().item()
+        return (min(0.0, mean - spread), max(0.0, mean + spread)) if math.isfinite(spread) else (0.0, 0.0)
+
+    def _twin_of(self, twin: DigitalTwin, kind: type[Anchored | NoisySensors]) -> DigitalTwin:
+        """A twin of the plant of this kind around that of a twin, under its closure, which keeps its code."""
+        kept = self._twins.get((twin, kind))
+        if kept is None or kept.closure is not twin.closure:
+            kept = self._twins[twin, kind] = twin.of(kind(twin.plant))
+        return kept
 
     def examine(self) -> TensorDict:
         """Fly the latest real episodes on the present twin.
 
         Returns:
-            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1. Nothing if
-            state feedback or the controller that flew first flew it.
+            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1, or a
+            ``reason`` if noise of the sensors explains it. Nothing if state feedback or the controller that flew first
+            flew it.
         """
         differences = self.differences()
         if not differences or math.isnan(differences[-1]) or not self._policy_flew:
             return metrics()
-        pairs = zip(differences, self.flown, strict=True)
-        quiet = [d for d, flown in pairs if flown.exploration <= QUIET and not math.isnan(d)]
-        warning, hypothesis = alarm(quiet), self.virtual.twin.hypothesis
-        report = metrics(paired_difference=differences[-1], alarm=float(warning is not None))
+        pairs = enumerate(zip(differences, self.flown, strict=True))
+        quiet = [k for k, (d, flown) in pairs if flown.exploration <= QUIET and not math.isnan(d)]
+        beyond_noise = [self._beyond_noise(k) for k in quiet[-2:]]
+        warning, hypothesis = alarm(beyond_noise), self.virtual.twin.hypothesis
+        reasons = []
+        if quiet[-1:] == [len(differences) - 1] and abs(differences[-1]) > ALARM and beyond_noise[-1] == 0.0:
+            ratio = math.exp(differences[-1])
+            reasons = [
+                f"noise of the sensors explains that the episode cost {ratio:.3g} times what the twin says of it"
+            ]
+        report = metrics(*reasons, paired_difference=differences[-1], alarm=float(warning is not None))
         if warning is None:
             return report
         explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
@@ -253,11 +310,11 @@ class Belief:
 
     @property
     def unexplained(self) -> float:
-        """Size of the last paired difference beyond what exploration explains."""
+        """Size of the last paired difference beyond what exploration and noise of the sensors explain."""
         differences = self.differences()
         if not differences or math.isnan(differences[-1]):
             return 0.0
-        return beyond(differences[-1], self.flown[-1].exploration)
+        return beyond(self._beyond_noise(len(differences) - 1), self.flown[-1].exploration)
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory], n: int) -> float:
@@ -323,9 +380,8 @@ class Belief:
 
     @property
     def contradicted(self) -> bool:
-        """Whether a real episode cost other than the present twin says, beyond what exploration explains."""
-        pairs = zip(self.differences(), self.flown, strict=True)
-        return any(beyond(d, flown.exploration) > NOISE for d, flown in pairs if not math.isnan(d))
+        """Whether an episode cost other than the present twin says, beyond what exploration and noise explain."""
+        return any(beyond(self._beyond_noise(k), flown.exploration) > NOISE for k, flown in enumerate(self.flown))
 
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
@@ -350,12 +406,9 @@ class Belief:
                 differences.append(d)
         if not whole:
             return None
-        anchored = self._twins.get(twin)
-        if anchored is None or anchored.closure is not twin.closure:
-            anchored = self._twins[twin] = twin.of(Anchored(twin.plant))
         replays = AnchoredReplays(
             self.virtual.twin,
-            anchored,
+            self._twin_of(twin, Anchored),
             [flown.trajectory for flown in whole],
             torch.cat(inputs),
             torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),

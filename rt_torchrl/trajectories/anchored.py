@@ -35,31 +35,39 @@ OBSERVATIONS = 64
 """Greatest number of observations of an episode in which actions are compared."""
 
 
-class Anchored(Extension):
+class FurtherInputs(Extension):
+    """A plant whose inputs are its own and one more for each state that sensors read, which only an interval gets."""
+
+    own_scheme = True
+    """What is added between intervals is no integral of the vector field."""
+    symbol, kind = "", ""
+    """Symbol of the further inputs, and what they are, which comes before the names of the states."""
+
+    def __init__(self, base: Plant):
+        super().__init__(base, [])
+        self.count = len(base.inputs)
+        further = [Signal(symbol=self.symbol, name=f"{self.kind}_{s.name}", unit=s.unit) for s in base.readings]
+        self.inputs = (*base.inputs, *further)
+
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
+        if "exogenous" in arguments:
+            arguments["exogenous"] = arguments["exogenous"][..., : self.count]
+        return super().ask(part, method, arguments)
+
+
+class Anchored(FurtherInputs):
     """A plant whose interval ends the increments e further; its inputs are those of the plant, and e.
 
     Args:
         base: the plant of a twin.
     """
 
-    own_scheme = True
-    """What is added at the end of an interval is no integral of the vector field."""
-
-    def __init__(self, base: Plant):
-        super().__init__(base, [])
-        self.count = len(base.inputs)
-        increments = [Signal(symbol="e", name=f"increment_{signal.name}", unit=signal.unit) for signal in base.readings]
-        self.inputs = (*base.inputs, *increments)
+    symbol, kind = "e", "increment"
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
         inputs, increments = exogenous[..., : self.count], exogenous[..., self.count :]
         (end, applied), n = self.base.step(t, state, command, inputs, closure), increments.shape[-1]
         return Transition(torch.cat([end[..., :n] + increments, end[..., n:]], -1), applied)
-
-    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
-        if "exogenous" in arguments:
-            arguments["exogenous"] = arguments["exogenous"][..., : self.count]
-        return super().ask(part, method, arguments)
 
 
 class AnchoredReplays:

@@ -123,15 +123,29 @@ class DigitalTwin:
         Raises:
             DivergenceError: if they diverge all the same.
         """
-        start = self.plant.at_rest(record.states[:1])
-        commands = torch.cat([record.actions, record.states[:-1]], -1)
-        drive = drive_of(self.plant, record.exogenous[None], commands[None], start=record.start)
+        return self.followed_from(record, record.states.new_zeros(1, record.states.shape[-1]))[:, 0]
+
+    @torch.no_grad()
+    def followed_from(self, record: Trajectory, shifts: Float[Tensor, "rows n_r"]) -> Float[Tensor, "samples rows n_s"]:
+        """The same for readings that are shifted, in several rows.
+
+        Args:
+            record: the record.
+            shifts: what is added to all readings in each row.
+
+        Raises:
+            DivergenceError: as :meth:`followed`.
+        """
+        rows, readings = len(shifts), record.states + shifts.unsqueeze(1)
+        start = self.plant.at_rest(readings[:, 0])
+        commands = torch.cat([record.actions.expand(rows, -1, -1), readings[:, :-1]], -1)
+        drive = drive_of(self.plant, record.exogenous.expand(rows, -1, -1), commands, start=record.start)
         # Kept, because the engine compares what is new to it with all that it knows, which takes milliseconds.
         if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
             self._read = ReadInterval(self.plant, self.closure, None)
         ends = Native().end_states(self._read, start, drive)
         require_finite(self.plant, ends, start, [self.closure], start=record.start)
-        return torch.cat([start, ends[:, 0]])
+        return torch.cat([start.unsqueeze(0), ends])
 
     def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Trajectory:
         """Virtual episodes under a policy; see :meth:`Rollout.__call__`.

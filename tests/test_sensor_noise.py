@@ -1,0 +1,120 @@
+"""Noise of sensors: what increments tell of it, closed loops that meet it, and alarms that it explains."""
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+
+from rt_torchrl import DigitalTwin, ExogenousConfig
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.trajectories.sensor_noise import NoisySensors, noise_levels
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+LEVELS = torch.tensor([0.03, 0.2], dtype=torch.float64)
+
+
+class Remembering(LinearQuadratic):
+    """A plant whose second state is what its controller read of the first one at the start of the interval."""
+
+    controller_states = memories = ("velocity",)
+
+    def memorise(self, t, state, exogenous):
+        return torch.stack([state[..., 0], state[..., 0]], -1)
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return torch.stack([action[..., 0] - 0.3 * state[..., 0], torch.zeros_like(state[..., 0])], -1)
+
+
+def episode(plant, policy, levels, *, seed, closure=None):
+    """Readings of a closed loop with noise of the sensors, what was applied, and J_a of the readings, interval by
+    interval in PyTorch; and the noise."""
+    generator = torch.Generator().manual_seed(seed)
+    state, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    noise = levels * torch.randn(1, plant.n_steps, len(levels), generator=generator, dtype=torch.float64)
+    noise[:, 0] = 0.0
+    readings, actions, cost = [state], [], 0.0
+    with torch.no_grad():
+        for k in range(plant.n_steps):
+            t, z = torch.tensor(k * plant.dt, dtype=torch.float64), inputs[:, k]
+            read = state + noise[:, k]
+            readings[-1] = read
+            end, applied = plant.step(t, state, policy(plant.observe(t, read, z)), z, closure or plant.closure)
+            if plant.memories:
+                end = torch.stack([end[:, 0], plant.memorise(t, read, z)[:, 1]], -1)
+            cost += plant.running_cost(t, read, applied, z).item() / plant.n_steps
+            actions.append(applied)
+            state = end
+            readings.append(state)
+    return Trajectory(torch.cat(readings), torch.cat(actions), inputs[0]), noise, cost
+
+
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+@pytest.mark.parametrize("kind", [LinearQuadratic, Remembering])
+def test_flights_with_noise_are_those_of_the_closed_loop_step_by_step(kind, engine):
+    plant, policy = kind(horizon=5.0), LinearGain([[0.8, 0.6]])
+    levels = LEVELS * torch.tensor([name not in plant.memories for name in ("position", "velocity")])
+    record, noise, cost = episode(plant, policy, levels, seed=1)
+    twin = DigitalTwin(NoisySensors(plant), plant.closure, engine=engine)
+    inputs = torch.cat([record.exogenous[None], noise], -1)
+    flown = twin.control(policy, record.states[:1], inputs)
+    torch.testing.assert_close(flown.actions[0].detach(), record.actions)
+    torch.testing.assert_close(flown.states[0, :-1].detach() + noise[0], record.states[:-1])
+    assert twin.cost(policy, record.states[:1], inputs).item() == pytest.approx(cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("shares", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+def test_increments_tell_the_noise_of_each_sensor(shares):
+    plant, policy = LinearQuadratic(horizon=40.0), LinearGain([[0.8, 0.6]])
+    levels = LEVELS * torch.tensor(shares)
+    records = [episode(plant, policy, levels, seed=seed)[0] for seed in range(4)]
+    found = noise_levels(DigitalTwin(plant, plant.closure), records)
+    assert found.tolist() == pytest.approx(levels.tolist(), rel=0.1, abs=0.003)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3, 1.0, 3.0])
+def test_what_the_twin_lacks_is_no_noise(missing):
+    plant, policy = LinearQuadratic(horizon=40.0), LinearGain([[0.8, 0.6]])
+    record, *_ = episode(plant, policy, 0.0 * LEVELS, seed=1)
+    wrong = LinearClosure(torch.tensor(plant.true_closure) + missing)
+    assert noise_levels(DigitalTwin(plant, wrong), [record]).tolist() == [0.0, 0.0]
+
+
+def test_increments_tell_the_noise_of_the_turbines_rotor_speed():
+    plant = WindTurbine(horizon=120.0)
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    levels = torch.tensor([0.01, *(len(plant.states) - 1) * [0.0]], dtype=torch.float64)
+    records = [episode(plant, policy, levels, seed=seed)[0] for seed in range(3)]
+    found = noise_levels(DigitalTwin(plant, plant.closure), records)
+    assert found[0].item() == pytest.approx(0.01, rel=0.15)
+    assert not found[-2:].any()  # the torque and the pitch, which the controller holds
+
+
+def believed(records, *, closure=None, level=LEVELS):
+    """The belief of a twin that has flown some episodes, the costs of the readings and the noise of the sensors."""
+    plant, policy = LinearQuadratic(horizon=20.0, noise=0.1), LinearGain([[0.8, 0.6]])
+    twin = DigitalTwin(plant, closure or plant.closure)
+    virtual = VirtualEpisodes(twin, ExogenousConfig(), 5, generator=torch.Generator().manual_seed(0))
+    belief = Belief({"model_based": policy}, virtual)
+    for seed in range(records):
+        record, _, cost = episode(plant, policy, level, seed=seed)
+        belief.append(record, "model_based", cost)
+    return belief
+
+
+def test_noise_raises_no_alarm_where_it_explains_what_an_episode_cost():
+    quiet, noisy = believed(4, level=0.0 * LEVELS), believed(4)
+    assert max(map(abs, quiet.differences())) < 1e-9
+    assert min(noisy.differences()[-2:]) > 0.15  # which would raise the alarm
+    report = noisy.examine()
+    assert report["alarm"] == 0.0 and "warning" not in report
+    assert "noise of the sensors explains that the episode cost 1.43 times" in report["reason"]
+    assert not noisy.contradicted and noisy.unexplained == 0.0
+    assert report["paired_difference"].item() == pytest.approx(noisy.differences()[-1])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 1.0])
+def test_noise_hides_no_twin_that_is_wrong(share):
+    belief = believed(4, closure=LinearClosure([[0.0, 0.0], [-0.2, 1.0]]), level=share * LEVELS)
+    assert belief.examine()["alarm"] == 1.0 and belief.contradicted
+    assert belief.unexplained == pytest.approx(abs(belief.differences()[-1]), rel=0.1)
