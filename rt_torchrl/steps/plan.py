@@ -16,7 +16,7 @@ from rt_torchrl.optimisers.simplex import by_simplex, searched
 from rt_torchrl.steps.belief import Belief, Judged, equal
 from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.inputs import both
-from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
+from rt_torchrl.steps.report import Step, in_words, merged, metrics, same_architecture, weight_change
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -328,7 +328,9 @@ class MultiStart:
             policy.load_state_dict(present)
             self.planner.restart()
             if further is None:
-                refused = metrics(plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
+                costs = f"{in_words(cost.expected, 4)}, the present weights {in_words(before.expected, 4)}"
+                reason = f"the plan is expected to cost {costs}"
+                refused = metrics(reason, plan_accepted=0.0, J_a_plan=report["J_a_plan_before"])
                 return Plan(present, before, report.update(refused))
             episodes = further
 
