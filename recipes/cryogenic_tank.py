@@ -84,8 +84,6 @@ class Config(rt.RunConfig):
             end.
         horizon: length of an episode T_o [s].
         fluid: pure fluid in the tank: Hydrogen, ParaHydrogen, Nitrogen, Oxygen or Methane.
-        noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
-            twinning.assimilation.initial is estimated.
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
         unknown: what the real system has beside its twin, one or more of bias_5, bias_15, bias_minus_15, drift_10,
             drift_25 (of the pressure sensor), valve_lag and all; docs/unknown_systems.md describes them.
@@ -121,18 +119,11 @@ class Config(rt.RunConfig):
             )
 
     def presets(self) -> dict[rt.Preset, dict[str, Any]]:
-        presets = super().presets() | {
+        return super().presets() | {
             "default": {"twinning": DEFAULT},
             "paper": {"start": "random", "command": "drop", "end_weight": 0.0, "twinning": PAPER_T3},
             "neural": {"closure": "mlp", "twinning": NEURAL},
         }
-        if self.noise:
-            # An error of 0.5 % in the first reading of the pressure lasts for five days: the closure makes up for it.
-            for preset in ("default", "neural"):
-                twinning = presets[preset]["twinning"]
-                estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
-                presets[preset]["twinning"] = dataclasses.replace(twinning, assimilation=estimated)
-        return presets
 
     def plant(self) -> rt.Plant:
         return unknown(self.tank(), self.unknown)

@@ -29,9 +29,12 @@ from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.steps.report import Step, merged, metrics
+from rt_torchrl.trajectories.sensor_noise import noise_levels
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+NOTHING = 1e-4
+"""Errors, as a share of the scatter of the readings, in which no noise is sought."""
 DAMPING = 1e-3
 """Damping μ of the first fit by Levenberg-Marquardt."""
 
@@ -42,7 +45,7 @@ class Assimilation:
     The expectation is over the records in D_S and, for each record, over realisations of its exogenous process. The
     *stored* actions drive all of them.
 
-    Note: the paper replays from the first reading of the sensors; ``initial="estimated"`` also finds the first state.
+    Note: the paper replays from the first reading of the sensors; where these have noise, first states are found, too.
 
     Args:
         twin: twin whose closure is updated in place; afterwards the closure holds the best weights seen, w_p*.
@@ -55,15 +58,19 @@ class Assimilation:
         self.descent = Descent(twin.closure, lbfgs if config.method == "lbfgs" else DescentConfig())
         self.damping = DAMPING
         """Damping μ with which the next fit by Levenberg-Marquardt begins."""
-        sensors = state_sensors(twin.plant)
-        spread = torch.zeros(len(twin.plant.states), dtype=torch.float64)
-        if config.initial == "estimated":
-            spread[[k for k in state_places(twin.plant, sensors) if k is not None]] = math.inf
-        self._problem = Estimation(twin, sensors, spread=spread)
+        self._estimate_first_states(config.initial == "estimated")
         self.length = config.segment or 0
         """Number of control intervals of the segments of the last fit; 0 for whole records."""
         self._records: Sequence[Trajectory] = ()
         self.begin()
+
+    def _estimate_first_states(self, estimates: bool) -> None:
+        """Pose the problem with first states as unknowns beside the weights, or with those that were measured."""
+        self.estimates, sensors = estimates, state_sensors(self.twin.plant)
+        spread = torch.zeros(len(self.twin.plant.states), dtype=torch.float64)
+        if estimates:
+            spread[[k for k in state_places(self.twin.plant, sensors) if k is not None]] = math.inf
+        self._problem = Estimation(self.twin, sensors, spread=spread)
 
     def begin(self) -> None:
         """Take the present closure for the ``first`` one, to which a twin that diverges goes back.
@@ -103,6 +110,26 @@ class Assimilation:
             whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
         if not self.config.iterations:
             return self._descend_anew(whole)
+        before, progress = copy.deepcopy(self.twin.closure.state_dict()), copy.deepcopy(self._progress())
+        descended = self._fit(whole)
+        if self.config.initial is None and self.config.estimable and not self.estimates and self._noisy(records):
+            self._estimate_first_states(True)
+            self.twin.closure.load_state_dict(before)
+            self._resume(progress)
+            descended = self._fit(whole)
+        return descended
+
+    def _noisy(self, records: Sequence[Trajectory]) -> bool:
+        """Whether the sensors have noise, as the present twin tells; not asked where it leaves next to nothing."""
+        sensors = self._problem.sensors
+        scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, batch_of(records)))
+        if (self._rms(self.in_segments(batch_of(records))) <= NOTHING * scatter).all():
+            return False
+        with contextlib.suppress(FloatingPointError):
+            return bool(noise_levels(self.twin, records).any())
+        return False
+
+    def _fit(self, whole: Trajectory) -> Descended:
         if self.config.segment is None:
             return self._over_chosen_segments(whole)
         self.length = min(self.config.segment, whole.actions.shape[1])
@@ -179,7 +206,7 @@ class Assimilation:
     def _least_squares(self, replayed: Trajectory) -> Descended:
         """Descend by Levenberg-Marquardt; the damping goes on from episode to episode."""
         likelihood = self.likelihood(replayed, prior=self.prior)
-        tolerance = 1e-4 if self.config.initial == "measured" else NOISE_TOLERANCE
+        tolerance = NOISE_TOLERANCE if self.estimates else 1e-4
         method = LevenbergMarquardt(likelihood.unknowns, damping=self.damping, tolerance=tolerance)
         descended = method.run(likelihood.normal_equations, self.config.iterations, stop_below=self.config.stop_below)
         self.damping = method.damping
@@ -196,7 +223,7 @@ class Assimilation:
     def cost_of(self, whole: Trajectory) -> float:
         """J_p of whole records under the present closure, without the prior; infinite if the twin diverges on them."""
         with contextlib.suppress(FloatingPointError):
-            if self.config.initial == "measured":
+            if not self.estimates:
                 return self._identification_cost(whole).item()
             return self._problem.fit_initial_states(*self._compared(whole)).normal_equations().cost.item()
         return math.inf
@@ -215,7 +242,7 @@ class Assimilation:
         sensors, count = self._problem.sensors, len(replayed.states)
         noise = replayed.states.new_tensor([math.sqrt(count) * (sensor.noise or 1.0) for sensor in sensors])
         records = sensor_records(self.twin.plant, sensors, replayed)
-        if self.config.initial == "measured":  # no error is seen where a replay begins
+        if not self.estimates:  # no error is seen where a replay begins
             for record in records:
                 record.readings[0] = math.nan
         return records, noise
@@ -224,7 +251,7 @@ class Assimilation:
     def _rms(self, replayed: Trajectory) -> Float[Tensor, " n_y"]:
         """RMS error of every state that J_p compares; infinite if the twin diverges."""
         try:
-            if self.config.initial == "estimated":
+            if self.estimates:
                 return judged(self._problem.fit_initial_states(*self._compared(replayed))).rms
             flown = self._flown(replayed)
         except FloatingPointError:
@@ -273,17 +300,18 @@ class Assimilation:
         noise = torch.maximum(self._rms(replayed), 1e-9 * noise)
         with contextlib.suppress(FloatingPointError):
             likelihood = self._problem.likelihood(read, noise)
-            if self.config.initial == "estimated":
+            if self.estimates:
                 likelihood.initial.load_state_dict(self._problem.fit_initial_states(read, noise).initial.state_dict())
             return Uncertainty(likelihood, errors="robust")
         return None
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return self._progress() | {"first": self.first, "length": self.length}
+        return self._progress() | {"first": self.first, "length": self.length, "estimates": self.estimates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._resume(state)
+        self._estimate_first_states(state["estimates"])
         self.length = state["length"]
         closure = self.twin.closure
         present = copy.deepcopy(closure.state_dict())

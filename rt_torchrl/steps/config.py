@@ -152,6 +152,8 @@ class AssimilationConfig:
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
+            None lets the data choose: ``estimated`` from the first fit on that leaves noise of the sensors, see
+            :mod:`rt_torchrl.trajectories.sensor_noise`, where it can be.
     """
 
     iterations: Count = 15
@@ -160,10 +162,15 @@ class AssimilationConfig:
     method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "levenberg_marquardt"
     prior: NotNegative = 0.0
     segment: Count | None = None
-    initial: Literal["measured", "estimated"] = "measured"
+    initial: Literal["measured", "estimated"] | None = None
+
+    @property
+    def estimable(self) -> bool:
+        """Whether first states can be unknowns beside the weights."""
+        return (self.method, self.inputs) == ("levenberg_marquardt", "record")
 
     def __post_init__(self) -> None:
-        if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
+        if self.initial == "estimated" and not self.estimable:
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
