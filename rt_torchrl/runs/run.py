@@ -231,12 +231,13 @@ class Run:
             self._drop_half_an_episode()
             real_side.end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
+            began = time.perf_counter()
             self._follow_wear()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
             real = self._fly_the_real_system(bar)
-            metrics = self._results(gap, flights, judged, real)
+            metrics = self._results(gap, flights, judged, real, time.perf_counter() - began)
             if self.config.figures:
                 bar.doing("drawing the figures")
                 dashboard.images(self._drawn(flights, judged), len(self.episodes))
@@ -345,6 +346,7 @@ class Run:
         flights: dict[str, Trajectory],
         judged: dict[str, Judged],
         real: dict[str, Any] | None,
+        judging: float,
     ) -> dict[str, Any]:
         parts = self.initial_policies, self.initial_closure, self.episodes
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
@@ -356,6 +358,7 @@ class Run:
             summary["reference"] = results.reference_of(self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
         total = time.perf_counter() - self.started
+        summary["seconds"]["judge"] = judging
         summary["seconds"] |= {"rest": total - sum(summary["seconds"].values()), "total": total}
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
