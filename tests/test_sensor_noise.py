@@ -72,6 +72,16 @@ def test_increments_tell_the_noise_of_each_sensor(shares):
     assert found.tolist() == pytest.approx(levels.tolist(), rel=0.1, abs=0.003)
 
 
+def test_what_was_not_measured_tells_no_noise():
+    plant, policy = LinearQuadratic(horizon=40.0), LinearGain([[0.8, 0.6]])
+    twin, (record, *_) = DigitalTwin(plant, plant.closure), episode(plant, policy, LEVELS, seed=1)
+    seen = torch.rand(len(record.states), generator=torch.Generator().manual_seed(0)) > 0.1
+    record.states[~seen] = 100.0
+    assert noise_levels(twin, [record._replace(seen=seen)]).tolist() == pytest.approx(LEVELS.tolist(), rel=0.15)
+    every_second = torch.arange(len(record.states)) % 2 == 0
+    assert noise_levels(twin, [record._replace(seen=every_second)]).tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.3, 1.0, 3.0])
 def test_what_the_twin_lacks_is_no_noise(missing):
     plant, policy = LinearQuadratic(horizon=40.0), LinearGain([[0.8, 0.6]])

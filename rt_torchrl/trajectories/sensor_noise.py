@@ -69,6 +69,8 @@ class NoisySensors(FurtherInputs):
 def noise_levels(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Tensor, " n_r"]:
     """Standard deviation σ of the white noise of each sensor, zero where increments show none.
 
+    Only three measured samples in a row tell something.
+
     Args:
         twin: the twin, fitted to the records.
         records: what sensors have read in real episodes, and what was applied.
@@ -83,9 +85,11 @@ def noise_levels(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Tens
         ends = twin.followed_from(record, shifts)[1:, :, : len(signals)]
         missed = differences(signals, record.states[1:], ends[:, 0])
         slope = differences(signals, ends[:, 1:], ends[:, :1]) / sizes[:, None]  # of the second index by the first
-        earlier.append(missed[:-1])
-        later.append(missed[1:])
-        slopes.append(slope[1:].nan_to_num(posinf=0.0, neginf=0.0))
+        seen = torch.ones_like(record.states[:, 0], dtype=torch.bool) if record.seen is None else record.seen
+        measured = seen[:-2] & seen[1:-1] & seen[2:]
+        earlier.append(missed[:-1][measured])
+        later.append(missed[1:][measured])
+        slopes.append(slope[1:][measured].nan_to_num(posinf=0.0, neginf=0.0))
     e, following, A = torch.cat(earlier), torch.cat(later), torch.cat(slopes)
     squares = following.square().mean(0)
     weighted = A * squares.reciprocal().nan_to_num(posinf=0.0)
