@@ -6,9 +6,10 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
 from rt_torchrl import DigitalTwin, ExogenousConfig
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.trajectories.sensor_noise import NoisySensors, noise_levels
+from rt_torchrl.trajectories.anchored import NoisySensors
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 LEVELS = torch.tensor([0.03, 0.2], dtype=torch.float64)

@@ -17,9 +17,15 @@ from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Input, Inputs, State, States, Time
-from rt_torchrl.plants.signal import Measurement, Named, Preview, state_read
+from rt_torchrl.plants.signal import Measurement, Named, Preview, differences, state_read
 from rt_torchrl.trajectories.engines.interval import batched
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+SHIFT = 1e-4
+"""Step of the differences that give the Jacobian A of an interval, as a share of the scatter of each reading."""
+MOST = 0.5
+"""Share of the mean square of increments that noise explains of a sensor that has some."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,3 +228,50 @@ def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]
 def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:
     """Inputs of all samples; the last sample, which no interval follows, has those of the last interval."""
     return torch.cat([exogenous, exogenous[..., -1:, :]], -2)
+
+
+@torch.no_grad()
+def noise_levels(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Tensor, " n_r"]:
+    r"""Standard deviation σ of the white noise of each sensor that reads a state, zero where increments show none.
+
+    A sensor reads :math:`y_k = s_k + n_k`. The increments that a right twin misses are
+
+    .. math:: e_k = y_{k+1} - \Phi(y_k, a_k, z_k) \approx n_{k+1} - A_k n_k, \qquad A_k = \partial\Phi/\partial s
+
+    Neighbours of them are alike by :math:`E[e_k n_k^\top] = -A_k\Sigma`, with the diagonal Σ of the variances of the
+    noise, which what the twin lacks is not: it is smooth, or new in each interval. Least squares give
+
+    .. math:: \sigma_j^2 = -\sum_k e_{k-1,j}\,A_{k,j}^\top We_k \Big/ \sum_k A_{k,j}^\top WA_{k,j}
+
+    with the column :math:`A_{k,j}` and the weights W, one over the mean square of each increment. A sensor whose
+    increments are mostly something else has none. Only three measured samples in a row tell something.
+
+    Args:
+        twin: the twin, fitted to the records.
+        records: what sensors have read in real episodes, and what was applied.
+
+    Raises:
+        DivergenceError: if the twin diverges within an interval that begins with what was read.
+
+    Source: Odelson, Rajamani, Rawlings, Automatica 42 (2006) 303, who estimate covariances of noise by
+    autocovariances.
+    """
+    signals, earlier, later, slopes = twin.plant.readings, list[Tensor](), list[Tensor](), list[Tensor]()
+    for record in records:
+        sizes = SHIFT * record.states.std(0)
+        shifts = torch.cat([torch.zeros_like(sizes)[None], sizes.diag()])
+        ends = twin.followed_from(record, shifts)[1:, :, : len(signals)]
+        missed = differences(signals, record.states[1:], ends[:, 0])
+        slope = differences(signals, ends[:, 1:], ends[:, :1]) / sizes[:, None]  # of the second index by the first
+        seen = torch.ones_like(record.states[:, 0], dtype=torch.bool) if record.seen is None else record.seen
+        measured = seen[:-2] & seen[1:-1] & seen[2:]
+        earlier.append(missed[:-1][measured])
+        later.append(missed[1:][measured])
+        slopes.append(slope[1:][measured].nan_to_num(posinf=0.0, neginf=0.0))
+    e, following, A = torch.cat(earlier), torch.cat(later), torch.cat(slopes)
+    squares = following.square().mean(0)
+    weighted = A * squares.reciprocal().nan_to_num(posinf=0.0)
+    products = -(e * (weighted * following.unsqueeze(1)).sum(-1)).sum(0)
+    variances = (products / (weighted * A).sum((0, 2))).nan_to_num().clamp_min(0.0)
+    explained = variances + variances @ A.square().mean(0)
+    return torch.where(explained > MOST * squares, variances, 0.0).sqrt()

@@ -14,27 +14,25 @@ from torch import Tensor
 from rt_torchrl.fit.least_squares import (
     EXPLAINED,
     NOISE_TOLERANCE,
+    SURE,
     Estimation,
     judged,
     over_segments,
     scatter_of,
 )
 from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
-from rt_torchrl.fit.sensors import SensorRecord, sensor_records, state_places, state_sensors
+from rt_torchrl.fit.sensors import SensorRecord, noise_levels, sensor_records, state_places, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import AssimilationConfig
+from rt_torchrl.steps.config import ESTIMABLE, AssimilationConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.steps.report import Step, merged, metrics
-from rt_torchrl.trajectories.sensor_noise import noise_levels
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-NOTHING = 1e-4
-"""Errors, as a share of the scatter of the readings, in which no noise is sought."""
 DAMPING = 1e-3
 """Damping μ of the first fit by Levenberg-Marquardt."""
 
@@ -111,8 +109,9 @@ class Assimilation:
         if not self.config.iterations:
             return self._descend_anew(whole)
         before, progress = copy.deepcopy(self.twin.closure.state_dict()), copy.deepcopy(self._progress())
-        descended = self._fit(whole)
-        if self.config.initial is None and self.config.estimable and not self.estimates and self._noisy(records):
+        descended, config = self._fit(whole), self.config
+        chooses = config.initial is None and (config.method, config.inputs) == ESTIMABLE
+        if chooses and not self.estimates and self._noisy(records):
             self._estimate_first_states(True)
             self.twin.closure.load_state_dict(before)
             self._resume(progress)
@@ -120,10 +119,10 @@ class Assimilation:
         return descended
 
     def _noisy(self, records: Sequence[Trajectory]) -> bool:
-        """Whether the sensors have noise, as the present twin tells; not asked where it leaves next to nothing."""
+        """Whether the sensors have noise, as the present twin tells; not asked where errors are tiny."""
         sensors = self._problem.sensors
         scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, batch_of(records)))
-        if (self._rms(self.in_segments(batch_of(records))) <= NOTHING * scatter).all():
+        if (self._rms(self.in_segments(batch_of(records))) <= SURE * EXPLAINED * scatter).all():
             return False
         with contextlib.suppress(FloatingPointError):
             return bool(noise_levels(self.twin, records).any())

@@ -18,7 +18,7 @@ whole episodes descend this one; updates, clones and the referee of step 6 compa
 quiet flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
 episode refuted does not come back because policies like it were cheap. How well the episodes predict each other chooses
 σ and v. A twin that says of all these episodes what they cost, within 5 % and what exploration and noise of the sensors
-(:mod:`~rt_torchrl.trajectories.sensor_noise`) explain, is believed as it is.
+(:func:`~rt_torchrl.fit.sensors.noise_levels`) explain, is believed as it is.
 """
 
 import contextlib
@@ -36,12 +36,12 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten
 
+from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import metrics, same_architecture
-from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
+from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays, NoisySensors
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.sensor_noise import NoisySensors, noise_levels
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, whole_cost
 from rt_torchrl.trajectories.twin import DigitalTwin

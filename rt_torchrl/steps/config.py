@@ -127,6 +127,10 @@ class RefereeConfig:
     clone_patience: Count = 3
 
 
+ESTIMABLE = ("levenberg_marquardt", "record")
+"""Method of the fit, and inputs of its replays, with which first states can be unknowns beside the weights."""
+
+
 @configuration
 class AssimilationConfig:
     """Parameters of step 4.
@@ -153,7 +157,7 @@ class AssimilationConfig:
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
             None lets the data choose: ``estimated`` from the first fit on that leaves noise of the sensors, see
-            :mod:`rt_torchrl.trajectories.sensor_noise`, where it can be.
+            :func:`rt_torchrl.fit.sensors.noise_levels`, of more than 1 % of the scatter of what they read.
     """
 
     iterations: Count = 15
@@ -164,13 +168,8 @@ class AssimilationConfig:
     segment: Count | None = None
     initial: Literal["measured", "estimated"] | None = None
 
-    @property
-    def estimable(self) -> bool:
-        """Whether first states can be unknowns beside the weights."""
-        return (self.method, self.inputs) == ("levenberg_marquardt", "record")
-
     def __post_init__(self) -> None:
-        if self.initial == "estimated" and not self.estimable:
+        if self.initial == "estimated" and (self.method, self.inputs) != ESTIMABLE:
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
