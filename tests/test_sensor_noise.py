@@ -4,8 +4,9 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
-from rt_torchrl import DigitalTwin, ExogenousConfig
+from rt_torchrl import ClassicalController, DigitalTwin, ExogenousConfig
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.evaluation.unseen import TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.inputs import VirtualEpisodes
@@ -129,3 +130,42 @@ def test_noise_hides_no_twin_that_is_wrong(share):
     belief = believed(4, closure=LinearClosure([[0.0, 0.0], [-0.2, 1.0]]), level=share * LEVELS)
     assert belief.examine()["alarm"] == 1.0 and belief.contradicted
     assert belief.unexplained == pytest.approx(abs(belief.differences()[-1]), rel=0.1)
+
+
+class Proportional(ClassicalController):
+    """The linear gain of readings."""
+
+    gain_units = {"position": "N/m", "velocity": "N s/m"}
+    default_gains = (0.3, 0.3)
+
+    def law(self, state, memory, exogenous):
+        assert exogenous.shape[-1] == 1
+        return -(state * self.gains).sum(-1, keepdim=True), memory
+
+
+def test_unseen_episodes_on_the_twin_meet_the_noise_of_the_sensors():
+    """Policies, controllers with a memory and predictive control read it, and costs are those of readings."""
+    plant = LinearQuadratic(horizon=5.0, noise=0.0)
+    unseen = TwinEpisodes(DigitalTwin(plant, plant.closure), plant, 200)
+    law, policy = Proportional(plant), LinearGain([[0.3, 0.3]])
+    quiet = unseen.control_costs(policy)
+    torch.testing.assert_close(unseen.control_costs(law), quiet)
+    unseen.noise = LEVELS
+    noisy = unseen.fly(policy)
+    torch.testing.assert_close(unseen.fly(law).states, noisy.states)
+    costs = unseen.control_costs(policy)
+    assert torch.equal(costs, unseen.control_costs(policy))
+    # The closed loop step by step, with other noise.
+    generator, state, total = torch.Generator().manual_seed(7), unseen.initial_state, torch.zeros(200).double()
+    with torch.no_grad():
+        for k in range(plant.n_steps):
+            t, z = torch.tensor(k * plant.dt, dtype=torch.float64), unseen.exogenous[:, k]
+            read = state + LEVELS * torch.randn(200, 2, generator=generator, dtype=torch.float64)
+            end, applied = plant.step(t, state, policy(plant.observe(t, read, z)), z, plant.closure)
+            total += plant.running_cost(t, read, applied, z)
+            state = end
+    shares = [(values - quiet).mean().item() for values in (costs, total / plant.n_steps)]
+    assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[0] > 0.01
+    jumps = noisy.states[:, 1:] - noisy.states[:, :-1]
+    assert jumps[..., 1].std() > LEVELS[1]  # of readings, and not of states
+    assert unseen.judge(noisy).control_costs.tolist() == pytest.approx(costs.tolist())

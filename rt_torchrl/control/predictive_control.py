@@ -196,8 +196,8 @@ class RecedingHorizon:
         state, states, actions = initial_state, [initial_state.unsqueeze(1)], []
         for k in range(0, exogenous.shape[1], self.period):
             t, inputs = k * self.plant.dt, exogenous[:, k : k + self.period]
-            measured = state[:, : len(self.plant.states)]  # the system may have more than the model knows
-            command = self.plan(t, measured, exogenous[:, k])[:, : inputs.shape[1]]
+            measured, now = plant.sensed(state, exogenous[:, k])  # of a system with more than the model knows
+            command = self.plan(t, measured[:, : len(self.plant.states)], now)[:, : inputs.shape[1]]
             flight = system(state, inputs, command, start=t)
             states.append(flight.states[:, 1:])
             actions.append(flight.actions)

@@ -7,11 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.anchored import NoisySensors
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import (
@@ -202,7 +204,8 @@ class TwinEpisodes(UnseenEpisodes):
 
     The real system does not move. Costs here are what the twin says, not what the real system would cost. Initial
     states and disturbances are the plant's draws. An episode in which the twin diverges costs NaN, and so do its mean
-    and its confidence interval.
+    and its confidence interval. With :attr:`noise` controllers get readings with it, and flights hold these readings,
+    as those of the real system do.
 
     Args:
         twin: the twin.
@@ -216,6 +219,9 @@ class TwinEpisodes(UnseenEpisodes):
     def __init__(self, twin: DigitalTwin, plant: Plant, count: int = 20, *, device: torch.device | str = "cpu"):
         super().__init__(plant, count, device=device)
         self.closure, self._twin = None, twin
+        self.noise: Tensor | None = None
+        """Standard deviation of the noise of each sensor; None for sensors without."""
+        self._noisy: DigitalTwin | None = None
 
     @property
     def flying(self) -> Plant:
@@ -224,10 +230,27 @@ class TwinEpisodes(UnseenEpisodes):
 
     def _flown(self, policy: nn.Module) -> Trajectory:
         """The flights on the twin; one in which the twin diverges is NaN from its first interval."""
+        twin, start = self._twin.believed, self.flying.at_rest(self.initial_state)
+        if self.noise is None or not self.noise.any():
+            return self._controlled(twin, policy, start, self.exogenous)
+        if self._noisy is None or self._noisy.closure is not twin.closure:  # kept with its code
+            self._noisy = twin.of(NoisySensors(twin.plant))
+        count, n, _ = self.exogenous.shape
+        generator = torch.Generator(device=start.device).manual_seed(UNSEEN_SEED)
+        noise = self.noise * torch.randn(count, n + 1, len(self.noise), generator=generator, dtype=torch.float64)
+        flown = self._controlled(self._noisy, policy, start, torch.cat([self.exogenous, noise[:, :-1]], -1))
+        noise = torch.where(twin.plant.ended(flown.states).unsqueeze(-1), 0.0, noise)  # so that what has ended has
+        readings = flown.states + functional.pad(noise, (0, flown.states.shape[-1] - noise.shape[-1]))
+        return Trajectory(readings, flown.actions, self.exogenous)
+
+    def _controlled(
+        self, twin: DigitalTwin, policy: nn.Module, starts: Tensor, inputs: Float[Tensor, "k n n_z"]
+    ) -> Trajectory:
+        """Episodes on a twin, of which those that diverge are NaN."""
 
         def flown(start: Tensor, exogenous: Tensor) -> Trajectory:
             try:
-                return self._twin.believed.control(policy, start, exogenous)
+                return twin.control(policy, start, exogenous)
             except DivergenceError:
                 if len(start) > 1:
                     alone = (flown(start[k : k + 1], exogenous[k : k + 1]).each()[0] for k in range(len(start)))
@@ -236,7 +259,7 @@ class TwinEpisodes(UnseenEpisodes):
                 lost, actions = nan.split([start.shape[-1], len(self.plant.actions)], -1)
                 return Trajectory(torch.cat([start[:, None], lost], 1), actions, exogenous)
 
-        return flown(self.flying.at_rest(self.initial_state), self.exogenous)
+        return flown(starts, inputs)
 
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""

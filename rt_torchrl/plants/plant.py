@@ -223,6 +223,10 @@ class Plant(nn.Module):
         applied = self.actuate(state, command)
         return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
+    def sensed(self, state: State, exogenous: Input) -> tuple[Float[Tensor, "*batch n_r"], Input]:
+        """What sensors read of states and inputs, of which state feedback makes its commands."""
+        return state[..., : len(self.readings)], exogenous
+
     def at_rest(self, readings: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return readings

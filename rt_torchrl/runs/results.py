@@ -1,5 +1,6 @@
 """The results of a run in numbers, as ``metrics.json`` holds them, and as a table for the terminal."""
 
+import contextlib
 import math
 import warnings
 from collections import Counter
@@ -16,6 +17,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
 from rt_torchrl.fit.least_squares import not_white
+from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
@@ -121,20 +123,34 @@ def summarise(
     }
 
 
+@torch.no_grad()
+def noise_of(algorithm: ReinforcementTwinning) -> Float[Tensor, " n_r"] | None:
+    """Standard deviation of the noise of each sensor in the latest real episodes, by the twin; None without."""
+    levels = None
+    if algorithm.config.arm != "model_free":
+        with contextlib.suppress(FloatingPointError):
+            levels = noise_levels(algorithm.twin.believed, list(algorithm.short_term))
+    return levels if levels is not None and levels.any() else None
+
+
 def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     """How the believed twin replays the records that it was last fitted to.
 
     ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
-    0; ``standard_errors`` those of the closure's coefficients, and ``note`` what these do not hold, in words.
+    0; ``noise`` the noise of the sensors; ``standard_errors`` those of the closure's coefficients, and ``note`` what
+    these do not hold, in words.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
-        return {"rms": {}, "segment": 0, "standard_errors": {}, "note": ""}
+        return {"rms": {}, "segment": 0, "noise": {}, "standard_errors": {}, "note": ""}
+    noise, signals = noise_of(algorithm), algorithm.twin.plant.readings
+    levels = [] if noise is None else zip(signals, noise.tolist(), strict=True)
     latest, _ = algorithm.virtual.paired(records)
     uncertainty = assimilation.uncertainty(latest)
     return {
         "rms": assimilation.rms_errors(latest),
         "segment": assimilation.length,
+        "noise": {f"{signal.name} [{signal.unit}]": level for signal, level in levels if level},
         "standard_errors": {} if uncertainty is None else uncertainty.standard_errors(),
         "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
     }
@@ -274,6 +290,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     unseen, n = summary["unseen"], summary["unseen"]["episodes"]
     where = WHERE.get(unseen["judged_on"], "")
     twin = " on the twin" if on_the_twin(unseen) else ""
+    where += ", with noise of the sensors" if twin and summary["twin"]["noise"] else ""
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
     lines.append(f"  {'cost':<{width}}{'untrained':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
@@ -376,7 +393,10 @@ def fit_lines(twin: dict[str, Any]) -> list[str]:
     if not twin["rms"]:
         return []
     where = f"segments of {twin['segment']} intervals" if twin["segment"] else "its last records"
-    return [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
+    lines = [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
+    if twin["noise"]:
+        lines.append(f"  noise of the sensors: {', '.join(rms_words(twin['noise']))}")
+    return lines
 
 
 def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | None = None) -> list[str]:

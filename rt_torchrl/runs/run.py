@@ -17,7 +17,14 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
-from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, mean_with_confidence
+from rt_torchrl.evaluation.unseen import (
+    Baseline,
+    Judged,
+    RealController,
+    RealEpisodes,
+    TwinEpisodes,
+    mean_with_confidence,
+)
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
@@ -232,7 +239,7 @@ class Run:
             real_side.end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
-            self._follow_wear()
+            self._follow_the_system()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
@@ -281,7 +288,7 @@ class Run:
                 bar.write(f"episode {record['episode']}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         interval = self.config.unseen_every
         if interval and number % interval == 0:
-            self._follow_wear()
+            self._follow_the_system()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
@@ -292,10 +299,12 @@ class Run:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record, self.algorithm.policies)
 
-    def _follow_wear(self) -> None:
-        """Give the unseen episodes the real system's present closure, if it is known."""
+    def _follow_the_system(self) -> None:
+        """Give the unseen episodes the real system's present closure, if it is known, or else the sensors' noise."""
         if self.algorithm.env.closure is not None:
             self.unseen.closure = self.algorithm.env.closure
+        if isinstance(self.unseen, TwinEpisodes):
+            self.unseen.noise = results.noise_of(self.algorithm)
 
     def _drop_half_an_episode(self) -> None:
         """Go back to the end of the last whole episode after an interrupt."""

@@ -94,6 +94,9 @@ class NoisySensors(FurtherInputs):
         end, applied = self.base.step(t, state, command, inputs, closure)
         return Transition(with_memories(self.base, end, t, self.read(state, exogenous), inputs), applied)
 
+    def sensed(self, state: State, exogenous: Input) -> tuple[Tensor, Input]:
+        return self.base.sensed(self.read(state, exogenous), exogenous[..., : self.count])
+
     def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
         if {"state", "exogenous"} <= arguments.keys():
             arguments["state"] = self.read(arguments["state"], arguments["exogenous"])

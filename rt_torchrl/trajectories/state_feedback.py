@@ -68,8 +68,9 @@ class RememberingInterval(Interval):
 
     def answer(self, carry: Tensor, drive: Drive) -> tuple[Action, Memory]:
         """The command and the new memory; a subclass may read the drive's command, of any width."""
-        state, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
-        command, memory = self.policy.respond(state, memory, drive.exogenous)
+        state, memory = carry[..., : len(self.plant.states)], carry[..., len(self.plant.states) :]
+        readings, exogenous = self.plant.sensed(state, drive.exogenous)
+        command, memory = self.policy.respond(readings, memory, exogenous)
         return command, memory
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:
