@@ -290,7 +290,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     unseen, n = summary["unseen"], summary["unseen"]["episodes"]
     where = WHERE.get(unseen["judged_on"], "")
     twin = " on the twin" if on_the_twin(unseen) else ""
-    where += ", with noise of the sensors" if twin and summary["twin"]["noise"] else ""
+    if twin and summary["twin"]["noise"]:
+        where = where.replace(twin, f"{twin} with noise of the sensors")
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
     lines.append(f"  {'cost':<{width}}{'untrained':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
