@@ -23,17 +23,13 @@ from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 
-def flown_on(real, policy, physics, *, seed=0, count=2, noise=0.0):
-    """Records of the real system under a policy, the inputs, and J_a; actions explore by a share of a unit."""
+def flown_on(real, policy, physics, *, seed=0, count=2):
+    """Records of the real system under a policy, the inputs, and J_a."""
     generator = torch.Generator().manual_seed(seed)
     starts, inputs = real.draw_initial_state(count, generator), real.draw_exogenous(count, generator)
     with torch.no_grad():
         rollout = Rollout(real, real.closure, policy)
         flown, costs = rollout(starts, inputs), rollout.costs(starts, inputs)
-        if noise:
-            commands = flown.actions + noise * torch.randn(flown.actions.shape, generator=generator).double()
-            rollout = Rollout(real, real.closure)
-            flown, costs = rollout(starts, inputs, commands), rollout.costs(starts, inputs, commands)
     states = flown.states[..., : len(physics.readings)]
     return [Trajectory(states[k], flown.actions[k], inputs[k]) for k in range(count)], inputs, costs
 
@@ -169,7 +165,7 @@ def test_what_sensors_do_not_read_of_a_cost_counts(reported, counts):
     torch.testing.assert_close(anchored_costs(replays, policy), counts * costs, rtol=1e-6, atol=0.0)
 
 
-def belief_of(gains, real=None, physics=None, *, twin=None, noise=0.0):
+def belief_of(gains, real=None, physics=None, *, twin=None):
     """The belief after one flight with each of some gains, under other inputs; by default of the pushed plant."""
     real, physics = (real, physics or real) if real else pushed()
     twin = twin or DigitalTwin(physics, physics.closure)
@@ -177,7 +173,7 @@ def belief_of(gains, real=None, physics=None, *, twin=None, noise=0.0):
     belief = Belief({"model_based": LinearGain([[0.0, 0.0]])}, virtual)
     for seed, gain in enumerate(gains):
         policy = LinearGain([gain])
-        (record,), _, cost = flown_on(real, policy, physics, seed=seed, count=1, noise=noise)
+        (record,), _, cost = flown_on(real, policy, physics, seed=seed, count=1)
         belief.append(record, "model_based", cost.item(), weights=policy.state_dict())
     return belief
 
@@ -285,10 +281,7 @@ def test_of_weights_that_flew_their_own_flights_count_and_not_those_of_their_nei
     assert abs(first - second) > 0.1
     same, beside = LinearGain([[0.5, 0.5]]), LinearGain([[0.5005, 0.5]])
     assert belief.expected(same, 2.0) == pytest.approx(2.0 * math.exp(0.5 * (first + second) + 0.25 * noise))
-    loud = belief_of([(0.5, 0.5)] * 2, noise=0.5)
-    loud.flown = [flown._replace(exploration=0.5) for flown in loud.flown]
-    for corrected, policy in ((belief, beside), (loud, same)):
-        assert corrected.expected(policy, 2.0) == pytest.approx(2.0 * math.exp(corrected.correction(policy).item()))
+    assert belief.expected(beside, 2.0) == pytest.approx(2.0 * math.exp(belief.correction(beside).item()))
 
 
 @pytest.mark.parametrize("gain", [-1e3, -1e40])

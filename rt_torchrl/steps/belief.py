@@ -15,10 +15,10 @@ twin, its replay with what the twin did not explain may chance not to. The corre
 
 and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes. Plans over
 whole episodes descend this one; updates, clones and the referee of step 6 compare it. Of weights that flew, their own n
-quiet flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
+flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
 episode refuted does not come back because policies like it were cheap. How well the episodes predict each other chooses
-σ and v. A twin that says of all these episodes what they cost, within 5 % and what exploration and noise of the sensors
-(:func:`~rt_torchrl.fit.sensors.noise_levels`) explain, is believed as it is.
+σ and v. A twin that says of all these episodes what they cost, with what they explored, within 5 % and what noise of the
+sensors (:func:`~rt_torchrl.fit.sensors.noise_levels`) explains, is believed as it is.
 """
 
 import contextlib
@@ -34,9 +34,12 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.fit.sensors import noise_levels
+from rt_torchrl.plants.shapes import Actions
+from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import metrics, same_architecture
@@ -58,12 +61,10 @@ GROWTH = 10.0
 """The v that is expected beforehand, as a multiple of the mean square of the corrections of what flew."""
 PRIOR = 2.0
 """Number of episodes that what is expected of σ and v counts for."""
-EXPLORED = 2.0
-"""Standard deviation of d for each unit of exploration, as a share of half the ranges."""
+ROUNDING = 1e-9
+"""Greatest deviation from a policy's actions, as a share of their ranges, that is rounding."""
 DEARER = 5.0
 """Greatest size of d that counts. Beyond e⁵ it does not matter how wrong a prediction is."""
-QUIET = 0.02
-"""Exploration above which the cost of an episode says little about its policy."""
 ALARM = 0.15
 """Size of d of two episodes in a row, or half the size of d of one, from which the twin is called wrong."""
 NOISY_FLIGHTS = 16
@@ -71,13 +72,16 @@ NOISY_FLIGHTS = 16
 
 
 class Flown(NamedTuple):
-    """A real episode: its trajectory, the role and weights of the policy that flew it, its J_a and its exploration."""
+    """A real episode: its trajectory, the role and weights of the policy that flew it, and its J_a.
+
+    ``deviation`` is what it has explored beside the policy's actions; None for nothing.
+    """
 
     trajectory: Trajectory
     role: Role
     weights: dict[str, Tensor]
     cost: float
-    exploration: float = 0.0
+    deviation: Tensor | None = None
 
 
 class FirstFlown(NamedTuple):
@@ -144,10 +148,17 @@ class Belief:
         trajectory: Trajectory,
         role: Role,
         cost: float,
-        exploration: float = 0.0,
         weights: Mapping[str, Tensor] | None = None,
+        commands: Float[Tensor, "n n_a"] | None = None,
     ) -> None:
         """Add an episode that the policy with this role has just flown, with its present weights or with others.
+
+        Args:
+            trajectory: what sensors have read, and what was applied.
+            role: role of the policy.
+            cost: J_a as measured.
+            weights: weights of the policy; None for the present ones.
+            commands: commands with what they have explored; None for those of the policy.
 
         Raises:
             ValueError: if the cost is negative, because differences are logs of the ratio of two costs.
@@ -155,8 +166,23 @@ class Belief:
         self._require_ratio(cost)
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
-        self.flown = [*self.flown, Flown(trajectory, role, weights, cost, exploration)][-HISTORY:]
+        flown = Flown(trajectory, role, weights, cost)
+        if commands is not None:
+            flown = flown._replace(deviation=self._deviation(flown, commands))
+        self.flown = [*self.flown, flown][-HISTORY:]
         self._costs, self._anchored, self._policy_flew = None, None, True
+
+    @torch.no_grad()
+    def _deviation(self, flown: Flown, commands: Float[Tensor, "n n_a"]) -> Float[Tensor, "1 n n_a"] | None:
+        """What commands have explored beside those of the policy for the same readings; None where that is nothing."""
+        policy, record, plant = self.policy_of(flown), flown.trajectory, self.virtual.twin.plant
+        if isinstance(policy, StateFeedback):
+            return None
+        states = plant.at_rest(record.states[:-1])
+        t = record.start + plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device)
+        deviation = commands - policy(plant.observe(t, states, record.exogenous))
+        low, high = bounds(plant.actions, device=states.device)
+        return deviation.unsqueeze(0) if (deviation.abs() > ROUNDING * (high - low)).any() else None
 
     def _require_ratio(self, cost: float) -> None:
         """Refuse a negative cost, because a paired difference is the log of the ratio of two costs."""
@@ -231,7 +257,8 @@ class Belief:
                 if isinstance(self._policies[flown.role], StateFeedback):
                     costs.append(math.nan)
                 else:
-                    costs.append(virtual.cost(self.policy_of(flown), virtual.repeated(flown.trajectory)))
+                    episode = virtual.repeated(flown.trajectory)
+                    costs.append(virtual.cost(self.policy_of(flown), episode, explored(flown, episode)))
             self._costs, self._noise, self._by_noise = (copy.deepcopy(twin), costs), None, {}
         return self._costs[1]
 
@@ -265,9 +292,10 @@ class Belief:
             return 0.0, 0.0
         noise = inputs.new_zeros(1 + NOISY_FLIGHTS, inputs.shape[1], len(self._noise))
         noise[1:] = self._noise * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
-        flights = twin.plant.at_rest(starts).expand(len(noise), -1), inputs.expand(len(noise), -1, -1)
-        scenario = Scenario(flights[0], torch.cat([flights[1], noise], -1))
-        costs = self._twin_of(twin, NoisySensors).episode_costs(self.policy_of(flown), *scenario)
+        true_starts = twin.plant.at_rest(starts - noise[:, 0])  # of which the readings are those of the episode
+        scenario = Scenario(true_starts, torch.cat([inputs.expand(len(noise), -1, -1), noise], -1))
+        deviation = explored(flown, scenario)
+        costs = self._twin_of(twin, NoisySensors).episode_costs(self.policy_of(flown), *scenario, deviation)
         logs = (costs[1:] / costs[0]).log()
         mean, spread = logs.mean().item(), 2.0 * logs.std().item()
         return (min(0.0, mean - spread), max(0.0, mean + spread)) if math.isfinite(spread) else (0.0, 0.0)
@@ -290,12 +318,11 @@ class Belief:
         differences = self.differences()
         if not differences or math.isnan(differences[-1]) or not self._policy_flew:
             return metrics()
-        pairs = enumerate(zip(differences, self.flown, strict=True))
-        quiet = [k for k, (d, flown) in pairs if flown.exploration <= QUIET and not math.isnan(d)]
-        beyond_noise = [self._beyond_noise(k) for k in quiet[-2:]]
+        known = [k for k, d in enumerate(differences) if not math.isnan(d)]
+        beyond_noise = [self._beyond_noise(k) for k in known[-2:]]
         warning, hypothesis = alarm(beyond_noise), self.virtual.twin.hypothesis
         reasons = []
-        if quiet[-1:] == [len(differences) - 1] and abs(differences[-1]) > ALARM and beyond_noise[-1] == 0.0:
+        if abs(differences[-1]) > ALARM and beyond_noise[-1] == 0.0:
             ratio = math.exp(differences[-1])
             reasons = [
                 f"noise of the sensors explains that the episode cost {ratio:.3g} times what the twin says of it"
@@ -310,11 +337,11 @@ class Belief:
 
     @property
     def unexplained(self) -> float:
-        """Size of the last paired difference beyond what exploration and noise of the sensors explain."""
+        """Size of the last paired difference beyond what noise of the sensors explains."""
         differences = self.differences()
         if not differences or math.isnan(differences[-1]):
             return 0.0
-        return beyond(self._beyond_noise(len(differences) - 1), self.flown[-1].exploration)
+        return abs(self._beyond_noise(len(differences) - 1))
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory], n: int) -> float:
@@ -346,7 +373,7 @@ class Belief:
             return cost
         weights = {name: weight.clone() for name, weight in policy.state_dict().items()}
         pairs = zip(self.differences(), self.flown, strict=True)
-        flown = [d for d, flight in pairs if flight.exploration <= QUIET and equal(flight.weights, weights)]
+        flown = [d for d, flight in pairs if equal(flight.weights, weights)]
         try:
             if self.contradicted and flown and not any(map(math.isnan, flown)):
                 anchors = self.anchors()
@@ -380,8 +407,8 @@ class Belief:
 
     @property
     def contradicted(self) -> bool:
-        """Whether an episode cost other than the present twin says, beyond what exploration and noise explain."""
-        return any(beyond(self._beyond_noise(k), flown.exploration) > NOISE for k, flown in enumerate(self.flown))
+        """Whether an episode cost other than the present twin says, beyond what noise of the sensors explains."""
+        return any(abs(self._beyond_noise(k)) > NOISE for k in range(len(self.flown)))
 
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
@@ -501,9 +528,12 @@ class Belief:
         self._costs = self._anchored = None
 
 
-def beyond(d: float, exploration: float) -> float:
-    """Size of a paired difference beyond what the exploration of its episode explains."""
-    return abs(d) if exploration <= QUIET else abs(d) - 2.0 * EXPLORED * exploration
+def explored(flown: Flown, episodes: Scenario) -> Actions | None:
+    """What an episode has explored, to the horizon of each of the episodes in which it is flown again."""
+    count, n, _ = episodes.exogenous.shape
+    if flown.deviation is None:
+        return None
+    return functional.pad(flown.deviation, (0, 0, 0, n - flown.deviation.shape[1])).expand(count, -1, -1)
 
 
 def difference(real: float, predicted: float) -> float:
@@ -522,7 +552,7 @@ def alarm(differences: Sequence[float]) -> str | None:
     """What is wrong with the twin, in plain words; None if nothing is.
 
     Args:
-        differences: d of the latest quiet episodes, oldest first.
+        differences: d of the latest episodes, oldest first.
     """
     last = list(differences[-2:])
     if len(last) < 2 or not (min(last) > ALARM or max(last) < -ALARM):

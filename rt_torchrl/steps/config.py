@@ -183,9 +183,9 @@ class HypothesesConfig:
     Args:
         which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), ``none`` for the twin alone, or names
             of suspects, also of those that are taken only by name (:meth:`Plant.further_suspects`).
-        call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
-            which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
-            always.
+        call: size of the paired difference log J − log Ĵ of a real episode, beyond what noise of the sensors explains,
+            above which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits
+            them always.
 
     Raises:
         ValueError: if an argument is out of its range.

@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.report import Step, record_of
@@ -394,10 +395,10 @@ class VirtualEpisodes:
         return Scenario(initial_state, plant.with_previews(exogenous))
 
     @torch.no_grad()
-    def cost(self, policy: nn.Module, episodes: Scenario) -> float:
-        """Mean J_a of a policy; infinite if the twin diverges under it."""
+    def cost(self, policy: nn.Module, episodes: Scenario, deviation: Actions | None = None) -> float:
+        """Mean J_a of a policy, to whose commands a deviation may be added; infinite if the twin diverges under it."""
         try:
-            cost = self.twin.cost(policy, *episodes).item()
+            cost = self.twin.cost(policy, *episodes, deviation).item()
         except DivergenceError:
             return math.inf
         return cost if math.isfinite(cost) else math.inf

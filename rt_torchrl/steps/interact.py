@@ -62,6 +62,7 @@ class Flight(NamedTuple):
         faults: faults of the system in this episode and in the earlier attempts.
         whole: whether the record is that of a whole episode, to its horizon or to its early end.
         after: number of control intervals after an early end, and what each of them costs, L_e.
+        commands: the commands of the record's intervals, before safety layers and actuators.
     """
 
     transitions: TensorDict
@@ -71,6 +72,7 @@ class Flight(NamedTuple):
     faults: Sequence[Fault] = ()
     whole: bool = True
     after: tuple[int, float] = (0, 0.0)
+    commands: Tensor | None = None
 
     @property
     def ended(self) -> bool:
@@ -167,13 +169,14 @@ class RealFlights:
             refused.append(sound.reason)
             if len(refused) == FLIGHTS:
                 raise ValueError(tried_in_vain(refused)) from cause
+        commands = episode["action"][first:last].clone()
         parts = [_transitions(episode, part) for part in sound.parts]
         transitions, record = parts[sound.parts.index((first, last))], self._record(episode, (first, last))
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
-        return Flight(transitions, record, parts, refused, faults, sound.whole, after)
+        return Flight(transitions, record, parts, refused, faults, sound.whole, after, commands)
 
     def _record(self, episode: TensorDictBase, part: tuple[int, int]) -> Trajectory:
         """The trajectory of a part of an episode, with the actions that were applied."""
@@ -392,7 +395,7 @@ class Operating:
             flights.append(flight)
             order = self._order_of(flight)
             policy_flew |= order.version > 0 or order.name != FIRST
-            self.step.keep(flight, order.name, order.strength, order.weights)
+            self.step.keep(flight, order.name, order.weights)
         return flights, self._report(flights)
 
     def _order_of(self, flight: Flight) -> Order:
@@ -470,7 +473,7 @@ class Interact(Step):
         choice = self.supervisor.choose(live, self.judged)
         acting, strength = choice.policy, 0.0 if choice.role == FIRST else self.config.exploration.strength(number)
         flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
-        self.keep(flight, choice.role, self.flights.actor.strength, acting.state_dict())
+        self.keep(flight, choice.role, acting.state_dict())
         report = merged(report_of_flights([flight]), metrics(exploration=self.flights.actor.strength))
         report = merged(report, choice.report)
         if self.supervisor.limited:
@@ -478,7 +481,7 @@ class Interact(Step):
         report.update(metrics(**acting.report()) if isinstance(acting, StateFeedback) else {})
         return [flight], report.set_non_tensor("live", choice.role)
 
-    def keep(self, flight: Flight, pilot: str, strength: float, weights: Mapping[str, Tensor]) -> None:
+    def keep(self, flight: Flight, pilot: str, weights: Mapping[str, Tensor]) -> None:
         """Remember the record of a flight and, if it is one of a whole episode, what it cost."""
         self.short_term.append(flight.record)
         if not flight.whole:  # costs of parts cannot be compared with those of episodes
@@ -486,5 +489,4 @@ class Interact(Step):
         if pilot == FIRST:
             self.belief.append_first(flight.record, flight.cost.item())
         else:
-            explored = strength * self.config.exploration.noise
-            self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), explored, weights)
+            self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), weights, flight.commands)

@@ -96,7 +96,9 @@ class Rollout:
             DivergenceError: if a state is not finite; the message names plant, realisation, time and state.
             ImpureError: if policy, closure or plant answer one question in two ways, or mix realisations.
         """
-        drive = self._drive(initial_state, exogenous, command, start)
+        return self._flown(initial_state, exogenous, self._drive(initial_state, exogenous, command, start), start)
+
+    def _flown(self, initial_state: Starts, exogenous: Inputs, drive: Drive, start: Start) -> Trajectory:
         self._require_pure(self.interval, initial_state, drive)
         ends = self._engine.end_states(self.interval, initial_state, drive)
         require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
@@ -106,14 +108,24 @@ class Rollout:
         return Trajectory(states.transpose(0, 1), applied.transpose(0, 1), exogenous, start)
 
     def costs(
-        self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0
+        self,
+        initial_state: Starts,
+        exogenous: Inputs,
+        command: Actions | None = None,
+        *,
+        start: Start = 0.0,
+        deviation: Actions | None = None,
     ) -> Costs:
         """J_a of each trajectory of :meth:`__call__`, as :func:`control_cost` gives it; quicker, and in less memory.
+
+        Args:
+            initial_state, exogenous, command, start: as :meth:`__call__`.
+            deviation: what is added to the commands of the policy, such as what an episode has explored.
 
         Raises:
             ValueError, DivergenceError, ImpureError: as :meth:`__call__`.
         """
-        drive = self._drive(initial_state, exogenous, command, start)
+        drive = self._drive(initial_state, exogenous, command, start, deviation)
         # What is replayed runs on after an end, so that only its trajectory says when it ended.
         summed = self.plant.end_cost is None or self.interval.policy is not None
         self._require_pure(self._costed, functional.pad(initial_state, (0, 1)), drive)
@@ -123,13 +135,20 @@ class Rollout:
             if charged:  # the sum holds the change from the first state's
                 costs = costs + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
             return costs
-        return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
+        return control_cost(self.plant, self._flown(initial_state, exogenous, drive, start))
 
     def _require_pure(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
         if self.engine != "native" or initial_state.device.type != "cpu":  # which asks when it traces
             require_pure_once(interval, initial_state, drive)
 
-    def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:
+    def _drive(
+        self,
+        initial_state: Tensor,
+        exogenous: Tensor,
+        command: Tensor | None,
+        start: float | Tensor,
+        deviation: Tensor | None = None,
+    ) -> Drive:
         """The drive, after a check of everything."""
         plant, batch, n = self.plant, initial_state.shape[0], exogenous.shape[1] if exogenous.ndim == 3 else -1
         expected = {
@@ -141,8 +160,9 @@ class Rollout:
                 f"plant {plant.name!r} is rolled out "
                 + ("without a policy: pass command." if command is None else "with a policy: pass no command.")
             )
-        if command is not None:
-            expected["command"] = (command, (batch, n, len(plant.actions)))
+        for argument, actions in (("command", command), ("deviation", deviation)):
+            if actions is not None:
+                expected[argument] = (actions, (batch, n, len(plant.actions)))
         for argument, (value, shape) in expected.items():
             if tuple(value.shape) != shape or value.dtype != torch.float64:
                 raise ValueError(
@@ -151,7 +171,7 @@ class Rollout:
                 )
             if not all_finite(value):
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
-        return drive_of(plant, exogenous, command, start=start)
+        return drive_of(plant, exogenous, command if deviation is None else deviation, start=start)
 
 
 def refusal(engine: Engine, plant: Plant) -> str | None:

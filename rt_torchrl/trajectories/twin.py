@@ -157,15 +157,26 @@ class DigitalTwin:
             return policy.fly(initial_state, exogenous, self.closure, plant=self.plant)
         return self._planning(policy)(initial_state, exogenous)
 
-    def cost(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Float[Tensor, ""]:
+    def cost(
+        self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, deviation: Actions | None = None
+    ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
-        return self.episode_costs(policy, initial_state, exogenous).mean()
+        return self.episode_costs(policy, initial_state, exogenous, deviation).mean()
 
-    def episode_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
-        """J_a of each virtual episode under a policy, differentiable by its weights unless it is state feedback."""
+    def episode_costs(
+        self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, deviation: Actions | None = None
+    ) -> Costs:
+        """J_a of each virtual episode under a policy, differentiable by its weights unless it is state feedback.
+
+        Args:
+            policy: the policy.
+            initial_state: initial state of each episode.
+            exogenous: exogenous inputs.
+            deviation: what is added to the commands of a policy that is no state feedback; None for nothing.
+        """
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))
-        return self._planning(policy).costs(initial_state, exogenous)
+        return self._planning(policy).costs(initial_state, exogenous, deviation=deviation)
 
     def correct(self, correction: Callable[[nn.Module], Tensor] | None) -> None:
         """Take what real episodes say of costs: a function of a policy that gives the log of their ratio to its own.

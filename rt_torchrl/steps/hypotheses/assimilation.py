@@ -320,7 +320,7 @@ class EnsembleAssimilation(Assimilation):
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
 
         Args:
-            difference: paired difference of the latest episode beyond what exploration explains.
+            difference: paired difference of the latest episode beyond what noise of the sensors explains.
             generator: source of random numbers.
 
         Returns:

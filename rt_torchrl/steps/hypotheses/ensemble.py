@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Starts
 from rt_torchrl.steps.config import HypothesesConfig
 from rt_torchrl.trajectories.rollout import Engine, able
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -134,15 +135,16 @@ class TwinEnsemble(DigitalTwin):
         return flown._replace(states=flown.states[..., : len(self.plant.states)])
 
     def episode_costs(
-        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
-    ) -> Float[Tensor, " batch"]:
+        self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, deviation: Actions | None = None
+    ) -> Costs:
         """J_a of each virtual episode over the hypotheses.
 
         State feedback plans on the twin alone, and is flown under every hypothesis as a policy is, so that the costs of
         both can be compared.
         """
         twins = [self.twins[name] for name in self._shares]
-        costs = [twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins]
+        flights = ((twin, twin.plant.at_rest(initial_state)) for twin in twins)
+        costs = [twin.episode_costs(policy, start, exogenous, deviation) for twin, start in flights]
         return initial_state.new_tensor(list(self._shares.values())) @ torch.stack(costs)
 
 

@@ -13,7 +13,8 @@ from rt_torchrl.plants.plant import Plant, cost_rate, final_cost, held
 class Drive(NamedTuple):
     """Times t [s], exogenous inputs z and recorded commands of the intervals, with the time as first dimension.
 
-    Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a`` (zero-width with a policy).
+    Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a``; with a policy it is zero-width,
+    or what is added to the policy's commands.
     """
 
     t: Tensor
@@ -39,7 +40,8 @@ class Interval(nn.Module):
         """The command to the actuators at the start of the interval."""
         if self.policy is None:
             return drive.command
-        return self.policy(self.plant.observe(drive.t, state, drive.exogenous))
+        command: Tensor = self.policy(self.plant.observe(drive.t, state, drive.exogenous))
+        return command + drive.command if drive.command.shape[-1] else command
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """The state at the end of the interval."""
