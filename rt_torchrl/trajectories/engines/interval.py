@@ -13,8 +13,8 @@ from rt_torchrl.plants.plant import Plant, cost_rate, final_cost, held
 class Drive(NamedTuple):
     """Times t [s], exogenous inputs z and recorded commands of the intervals, with the time as first dimension.
 
-    Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a``; with a policy it is zero-width,
-    or what is added to the policy's commands.
+    Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a``; with a policy it has no
+    width, or is what is added to the policy's commands.
     """
 
     t: Tensor
