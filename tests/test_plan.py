@@ -126,7 +126,7 @@ def test_starts_that_find_nothing_change_no_training(optimiser, monkeypatch):
 class Chaotic(DigitalTwin):
     """Episodes like bowls; where the second gain is above 6 the closed loop is chaotic, and costs ripple by 1e-4."""
 
-    def episode_costs(self, policy, initial_state, exogenous):
+    def episode_costs(self, policy, initial_state, exogenous, deviation=None):
         gain = policy.gain.flatten()
         bowl = 1.0 + 0.01 * (gain - torch.tensor([2.0, 3.0]).double()).square().sum()
         phases = torch.linspace(0.0, 3.0, 4).double()

@@ -11,9 +11,9 @@ from torch.nn import functional
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.anchored import NoisySensors
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import (
@@ -204,8 +204,8 @@ class TwinEpisodes(UnseenEpisodes):
 
     The real system does not move. Costs here are what the twin says, not what the real system would cost. Initial
     states and disturbances are the plant's draws. An episode in which the twin diverges costs NaN, and so do its mean
-    and its confidence interval. With :attr:`noise` controllers get readings with it, and flights hold these readings,
-    as those of the real system do.
+    and its confidence interval. Where the twin's sensors have noise, controllers get readings with it, and flights hold
+    these readings, as those of the real system do.
 
     Args:
         twin: the twin.
@@ -219,8 +219,6 @@ class TwinEpisodes(UnseenEpisodes):
     def __init__(self, twin: DigitalTwin, plant: Plant, count: int = 20, *, device: torch.device | str = "cpu"):
         super().__init__(plant, count, device=device)
         self.closure, self._twin = None, twin
-        self.noise: Tensor | None = None
-        """Standard deviation of the noise of each sensor; None for sensors without."""
         self._noisy: DigitalTwin | None = None
 
     @property
@@ -231,13 +229,14 @@ class TwinEpisodes(UnseenEpisodes):
     def _flown(self, policy: nn.Module) -> Trajectory:
         """The flights on the twin; one in which the twin diverges is NaN from its first interval."""
         twin, start = self._twin.believed, self.flying.at_rest(self.initial_state)
-        if self.noise is None or not self.noise.any():
+        levels = self._twin.noise
+        if not levels.any():
             return self._controlled(twin, policy, start, self.exogenous)
         if self._noisy is None or self._noisy.closure is not twin.closure:  # kept with its code
             self._noisy = twin.of(NoisySensors(twin.plant))
         count, n, _ = self.exogenous.shape
         generator = torch.Generator(device=start.device).manual_seed(UNSEEN_SEED)
-        noise = self.noise * torch.randn(count, n + 1, len(self.noise), generator=generator, dtype=torch.float64)
+        noise = levels * torch.randn(count, n + 1, len(levels), generator=generator, dtype=torch.float64)
         flown = self._controlled(self._noisy, policy, start, torch.cat([self.exogenous, noise[:, :-1]], -1))
         noise = torch.where(twin.plant.ended(flown.states).unsqueeze(-1), 0.0, noise)  # so that what has ended has
         readings = flown.states + functional.pad(noise, (0, flown.states.shape[-1] - noise.shape[-1]))

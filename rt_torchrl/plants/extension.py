@@ -228,6 +228,26 @@ for _part, _methods in PARTS.items():
         setattr(Extension, _method, _delegated(_part, _method))
 
 
+class FurtherInputs(Extension):
+    """A plant whose inputs are its own and one more for each state that sensors read, which only an interval gets."""
+
+    own_scheme = True
+    """What is added between intervals is no integral of the vector field."""
+    symbol, kind = "", ""
+    """Symbol of the further inputs, and what they are, which comes before the names of the states."""
+
+    def __init__(self, base: Plant):
+        super().__init__(base, [])
+        self.count = len(base.inputs)
+        further = [Signal(symbol=self.symbol, name=f"{self.kind}_{s.name}", unit=s.unit) for s in base.readings]
+        self.inputs = (*base.inputs, *further)
+
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
+        if "exogenous" in arguments:
+            arguments["exogenous"] = arguments["exogenous"][..., : self.count]
+        return super().ask(part, method, arguments)
+
+
 def replaced(
     values: Float[Tensor, "*batch n"], place: int, value: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch n"]:

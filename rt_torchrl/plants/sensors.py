@@ -1,16 +1,17 @@
-"""Sensors that read with an offset, and policies that observe past readings."""
+"""Sensors that read with an offset or with noise, and policies that observe past readings."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
-from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.extension import Extension, FurtherInputs
+from rt_torchrl.plants.plant import Plant, Transition, with_memories
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.shapes import Action, Hidden, Input, Observation, State, Time
 from rt_torchrl.plants.signal import Signal, place_of
@@ -121,6 +122,36 @@ class BiasedSensor(Extension):
         true = self.base.draw_initial_state(batch, generator)
         hidden = self.rest(true)
         return torch.cat([self.true(true, -hidden[..., 0]), hidden], -1)
+
+
+class NoisySensors(FurtherInputs):
+    """A plant whose sensors read s + n; its inputs are those of the plant, and n, white or not.
+
+    Policies, memories and running costs get readings; actuators, the system and the end of an episode true states.
+
+    Args:
+        base: the plant of a twin.
+    """
+
+    symbol, kind = "n", "noise"
+
+    def read(self, state: State, exogenous: Input) -> State:
+        """The state with the noise of the sensors; what no sensor reads has none."""
+        noise = exogenous[..., self.count :]
+        return state + functional.pad(noise, (0, state.shape[-1] - noise.shape[-1]))
+
+    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
+        inputs = exogenous[..., : self.count]
+        end, applied = self.base.step(t, state, command, inputs, closure)
+        return Transition(with_memories(self.base, end, t, self.read(state, exogenous), inputs), applied)
+
+    def sensed(self, state: State, exogenous: Input) -> tuple[Tensor, Input]:
+        return self.base.sensed(self.read(state, exogenous), exogenous[..., : self.count])
+
+    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
+        if {"state", "exogenous"} <= arguments.keys():
+            arguments["state"] = self.read(arguments["state"], arguments["exogenous"])
+        return super().ask(part, method, arguments)
 
 
 class StackedObservations(Extension):

@@ -1,6 +1,5 @@
 """The results of a run in numbers, as ``metrics.json`` holds them, and as a table for the terminal."""
 
-import contextlib
 import math
 import warnings
 from collections import Counter
@@ -17,7 +16,6 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
 from rt_torchrl.fit.least_squares import not_white
-from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
@@ -123,16 +121,6 @@ def summarise(
     }
 
 
-@torch.no_grad()
-def noise_of(algorithm: ReinforcementTwinning) -> Float[Tensor, " n_r"] | None:
-    """Standard deviation of the noise of each sensor in the latest real episodes, by the twin; None without."""
-    levels = None
-    if algorithm.config.arm != "model_free":
-        with contextlib.suppress(FloatingPointError):
-            levels = noise_levels(algorithm.twin.believed, list(algorithm.short_term))
-    return levels if levels is not None and levels.any() else None
-
-
 def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     """How the believed twin replays the records that it was last fitted to.
 
@@ -143,8 +131,7 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
         return {"rms": {}, "segment": 0, "noise": {}, "standard_errors": {}, "note": ""}
-    noise, signals = noise_of(algorithm), algorithm.twin.plant.readings
-    levels = [] if noise is None else zip(signals, noise.tolist(), strict=True)
+    levels = zip(algorithm.twin.plant.readings, algorithm.twin.noise.tolist(), strict=True)
     latest, _ = algorithm.virtual.paired(records)
     uncertainty = assimilation.uncertainty(latest)
     return {

@@ -22,7 +22,6 @@ from rt_torchrl.evaluation.unseen import (
     Judged,
     RealController,
     RealEpisodes,
-    TwinEpisodes,
     mean_with_confidence,
 )
 from rt_torchrl.figures.snapshot import Snapshot
@@ -239,7 +238,7 @@ class Run:
             real_side.end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
-            self._follow_the_system()
+            self._follow_wear()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
@@ -288,7 +287,7 @@ class Run:
                 bar.write(f"episode {record['episode']}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         interval = self.config.unseen_every
         if interval and number % interval == 0:
-            self._follow_the_system()
+            self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
@@ -299,12 +298,10 @@ class Run:
             raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record, self.algorithm.policies)
 
-    def _follow_the_system(self) -> None:
-        """Give the unseen episodes the real system's present closure, if it is known, or else the sensors' noise."""
+    def _follow_wear(self) -> None:
+        """Give the unseen episodes the real system's present closure, if it is known."""
         if self.algorithm.env.closure is not None:
             self.unseen.closure = self.algorithm.env.closure
-        if isinstance(self.unseen, TwinEpisodes):
-            self.unseen.noise = results.noise_of(self.algorithm)
 
     def _drop_half_an_episode(self) -> None:
         """Go back to the end of the last whole episode after an interrupt."""

@@ -116,6 +116,9 @@ class Assimilation:
             self.twin.closure.load_state_dict(before)
             self._resume(progress)
             descended = self._fit(whole)
+        if self.estimates:
+            with contextlib.suppress(FloatingPointError):
+                self.twin.noise = noise_levels(self.twin, records)
         return descended
 
     def _noisy(self, records: Sequence[Trajectory]) -> bool:
@@ -306,11 +309,19 @@ class Assimilation:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return self._progress() | {"first": self.first, "length": self.length, "estimates": self.estimates}
+        return (
+            self._progress()
+            | {"first": self.first, "length": self.length}
+            | {
+                "estimates": self.estimates,
+                "noise": self.twin.noise,
+            }
+        )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._resume(state)
         self._estimate_first_states(state["estimates"])
+        self.twin.noise = state["noise"]
         self.length = state["length"]
         closure = self.twin.closure
         present = copy.deepcopy(closure.state_dict())

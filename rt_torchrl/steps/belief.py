@@ -37,13 +37,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils._pytree import tree_flatten
 
-from rt_torchrl.fit.sensors import noise_levels
+from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import metrics, same_architecture
-from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays, NoisySensors
+from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, whole_cost
@@ -136,7 +136,6 @@ class Belief:
         """The latest episodes of the controller that flew first."""
         self._policy_flew = True
         self._costs: tuple[Any, list[float]] | None = None
-        self._noise: Tensor | None = None
         self._by_noise = dict[int, tuple[float, float]]()
         self._anchored: tuple[Any, Anchors | None] | None = None
         self._twins = dict[tuple[DigitalTwin, type[Anchored | NoisySensors]], DigitalTwin]()
@@ -250,8 +249,8 @@ class Belief:
 
     def _predicted(self) -> list[float]:
         """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
-        twin, virtual = self.virtual.twin.state_dict(), self.virtual
-        if self._costs is None or not equal(twin, self._costs[0]):
+        state, virtual = self._twin_state(), self.virtual
+        if self._costs is None or not equal(state, self._costs[0]):
             costs = list[float]()
             for flown in self.flown:
                 if isinstance(self._policies[flown.role], StateFeedback):
@@ -259,11 +258,15 @@ class Belief:
                 else:
                     episode = virtual.repeated(flown.trajectory)
                     costs.append(virtual.cost(self.policy_of(flown), episode, explored(flown, episode)))
-            self._costs, self._noise, self._by_noise = (copy.deepcopy(twin), costs), None, {}
+            self._costs, self._by_noise = (copy.deepcopy(state), costs), {}
         return self._costs[1]
 
+    def _twin_state(self) -> dict[str, Any]:
+        """What the costs on the twin depend on."""
+        return self.virtual.twin.state_dict() | {"noise": self.virtual.twin.noise}
+
     def _beyond_noise(self, k: int) -> float:
-        """The paired difference of an episode beyond what noise of the sensors explains of a large one."""
+        """The paired difference of an episode beyond what other noise of the sensors explains of a large one."""
         d = self.differences()[k]
         if math.isnan(d) or abs(d) <= NOISE:
             return d
@@ -279,26 +282,26 @@ class Belief:
     def _explained_by_noise(self, flown: Flown) -> tuple[float, float]:
         """The least and the greatest paired difference of an episode that noise of the sensors explains.
 
-        They are two standard deviations from the mean of what flights of the twin cost with the noise over without it,
-        or zero.
+        They are two standard deviations from the mean of what flights of the twin cost with other noise over that with
+        the noise that its costs have, and hold what a flight without noise costs.
 
         Raises:
             DivergenceError: if the twin diverges with the noise.
         """
         twin, (starts, inputs) = self.virtual.twin.believed, self.virtual.repeated(flown.trajectory)
-        if self._noise is None:
-            self._noise = noise_levels(twin, [latest.trajectory for latest in self.flown[-ANCHORS:]])
-        if not self._noise.any():
+        levels, policy = self.virtual.twin.noise, self.policy_of(flown)
+        if not levels.any():
             return 0.0, 0.0
-        noise = inputs.new_zeros(1 + NOISY_FLIGHTS, inputs.shape[1], len(self._noise))
-        noise[1:] = self._noise * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
+        noise = inputs.new_zeros(1 + NOISY_FLIGHTS, inputs.shape[1], len(levels))
+        noise[1:] = levels * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
         true_starts = twin.plant.at_rest(starts - noise[:, 0])  # of which the readings are those of the episode
         scenario = Scenario(true_starts, torch.cat([inputs.expand(len(noise), -1, -1), noise], -1))
-        deviation = explored(flown, scenario)
-        costs = self._twin_of(twin, NoisySensors).episode_costs(self.policy_of(flown), *scenario, deviation)
-        logs = (costs[1:] / costs[0]).log()
-        mean, spread = logs.mean().item(), 2.0 * logs.std().item()
-        return (min(0.0, mean - spread), max(0.0, mean + spread)) if math.isfinite(spread) else (0.0, 0.0)
+        costs = self._twin_of(twin, NoisySensors).episode_costs(policy, *scenario, explored(flown, scenario))
+        episode = Scenario(twin.plant.at_rest(starts), inputs)
+        logs = (costs / twin.episode_costs(policy, *episode, explored(flown, episode))).log()
+        mean, spread = logs[1:].mean().item(), 2.0 * logs[1:].std().item()
+        ends = (0.0, logs[0].item(), mean - spread, mean + spread)
+        return (min(ends), max(ends)) if all(map(math.isfinite, ends)) else (0.0, 0.0)
 
     def _twin_of(self, twin: DigitalTwin, kind: type[Anchored | NoisySensors]) -> DigitalTwin:
         """A twin of the plant of this kind around that of a twin, under its closure, which keeps its code."""
@@ -413,7 +416,7 @@ class Belief:
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
         twin = self.virtual.twin
-        state = twin.state_dict()
+        state = self._twin_state()
         if self._anchored is None or not equal(state, self._anchored[0]):
             self._anchored = copy.deepcopy(state), self._anchors_on(twin.believed)
         return self._anchored[1]

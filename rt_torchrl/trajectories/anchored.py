@@ -11,8 +11,6 @@ to the twin. Added to a virtual episode from the same start under the same input
 they make it the real episode if the policy takes the actions that were flown, whatever the twin lacks. Near them the
 replay says to first order how the real system answers, by the twin's Jacobians along the *real* states.
 
-Flights with noise of the sensors are virtual episodes with further inputs, too.
-
 Sources: iterative learning control (Bristow, Tharayil, Alleyne, IEEE Control Systems 26 (2006) 96); gradients of a
 model along real trajectories (Abbeel, Quigley, Ng, ICML 2006).
 """
@@ -20,42 +18,20 @@ model along real trajectories (Abbeel, Quigley, Ng, ICML 2006).
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
-from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.plant import Plant, Transition, with_memories
+from rt_torchrl.plants.extension import FurtherInputs
+from rt_torchrl.plants.plant import Transition
 from rt_torchrl.plants.shapes import Action, Costs, Input, Inputs, Starts, State, Time
-from rt_torchrl.plants.signal import Signal, bounds, differences
+from rt_torchrl.plants.signal import bounds, differences
 from rt_torchrl.trajectories.trajectory import Trajectory, whole_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 OBSERVATIONS = 64
 """Greatest number of observations of an episode in which actions are compared."""
-
-
-class FurtherInputs(Extension):
-    """A plant whose inputs are its own and one more for each state that sensors read, which only an interval gets."""
-
-    own_scheme = True
-    """What is added between intervals is no integral of the vector field."""
-    symbol, kind = "", ""
-    """Symbol of the further inputs, and what they are, which comes before the names of the states."""
-
-    def __init__(self, base: Plant):
-        super().__init__(base, [])
-        self.count = len(base.inputs)
-        further = [Signal(symbol=self.symbol, name=f"{self.kind}_{s.name}", unit=s.unit) for s in base.readings]
-        self.inputs = (*base.inputs, *further)
-
-    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
-        if "exogenous" in arguments:
-            arguments["exogenous"] = arguments["exogenous"][..., : self.count]
-        return super().ask(part, method, arguments)
 
 
 class Anchored(FurtherInputs):
@@ -71,36 +47,6 @@ class Anchored(FurtherInputs):
         inputs, increments = exogenous[..., : self.count], exogenous[..., self.count :]
         (end, applied), n = self.base.step(t, state, command, inputs, closure), increments.shape[-1]
         return Transition(torch.cat([end[..., :n] + increments, end[..., n:]], -1), applied)
-
-
-class NoisySensors(FurtherInputs):
-    """A plant whose sensors read s + n; its inputs are those of the plant, and n, white or not.
-
-    Policies, memories and running costs get readings; actuators, the system and the end of an episode true states.
-
-    Args:
-        base: the plant of a twin.
-    """
-
-    symbol, kind = "n", "noise"
-
-    def read(self, state: State, exogenous: Input) -> State:
-        """The state with the noise of the sensors; what no sensor reads has none."""
-        noise = exogenous[..., self.count :]
-        return state + functional.pad(noise, (0, state.shape[-1] - noise.shape[-1]))
-
-    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        inputs = exogenous[..., : self.count]
-        end, applied = self.base.step(t, state, command, inputs, closure)
-        return Transition(with_memories(self.base, end, t, self.read(state, exogenous), inputs), applied)
-
-    def sensed(self, state: State, exogenous: Input) -> tuple[Tensor, Input]:
-        return self.base.sensed(self.read(state, exogenous), exogenous[..., : self.count])
-
-    def ask(self, part: str, method: str, arguments: dict[str, Any]) -> Any:
-        if {"state", "exogenous"} <= arguments.keys():
-            arguments["state"] = self.read(arguments["state"], arguments["exogenous"])
-        return super().ask(part, method, arguments)
 
 
 class AnchoredReplays:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rt_torchrl.plants.plant import Plant, require_end_cost
+from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
 from rt_torchrl.trajectories.engines.interval import Drive, Interval, batched, with_weights
@@ -40,6 +41,8 @@ from rt_torchrl.trajectories.rollout import (
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
+NOISE_SEED = 4_000_000
+"""Seed of the noise of sensors in virtual episodes."""
 KEPT = 4
 """Number of policies whose rollouts a twin keeps, such as those that are judged in turn."""
 
@@ -47,7 +50,8 @@ KEPT = 4
 class DigitalTwin:
     """Flies virtual episodes of a plant whose true closure it does not know.
 
-    The attribute ``sensitivities`` gives replayed states with their derivatives by the closure's weights.
+    The attribute ``sensitivities`` gives replayed states with their derivatives by the closure's weights. Costs of
+    policies are those of flights whose sensors have the :attr:`noise`, as the costs of the real system are.
 
     Args:
         plant: the physics, which a simulated real system shares; the plant's own closure is never used here.
@@ -67,6 +71,18 @@ class DigitalTwin:
         self._planned: list[_Planned] = []
         self._read: ReadInterval | None = None
         self._correction: Callable[[nn.Module], Tensor] | None = None
+        self._noise = torch.zeros(len(plant.readings), dtype=torch.float64)
+        self._noisy: DigitalTwin | None = None
+        self._drawn = torch.zeros(0)
+
+    @property
+    def noise(self) -> Float[Tensor, " n_r"]:
+        """Standard deviation of the noise of each sensor; zeros, until somebody sets it."""
+        return self._noise
+
+    @noise.setter
+    def noise(self, levels: Float[Tensor, " n_r"]) -> None:
+        self._noise, self._drawn = levels, torch.zeros(0)
 
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
@@ -174,6 +190,15 @@ class DigitalTwin:
             exogenous: exogenous inputs.
             deviation: what is added to the commands of a policy that is no state feedback; None for nothing.
         """
+        if self.noise.any():
+            if self._noisy is None or self._noisy.closure is not self.closure:  # kept with its code
+                self._noisy = self.of(NoisySensors(self.plant))
+            batch, n, _ = exogenous.shape
+            if self._drawn.shape[:2] != (batch, n):  # the same for every policy
+                drawn = torch.randn(batch, n, len(self.noise), generator=torch.Generator().manual_seed(NOISE_SEED))
+                self._drawn = self.noise * drawn.to(exogenous)
+            inputs = torch.cat([exogenous, self._drawn], -1)
+            return self._noisy.episode_costs(policy, initial_state, inputs, deviation)
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))
         return self._planning(policy).costs(initial_state, exogenous, deviation=deviation)
