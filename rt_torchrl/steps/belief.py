@@ -249,7 +249,8 @@ class Belief:
 
     def _predicted(self) -> list[float]:
         """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
-        state, virtual = self._twin_state(), self.virtual
+        virtual, twin = self.virtual, self.virtual.twin
+        state = twin.state_dict() | {"noise": twin.noise}
         if self._costs is None or not equal(state, self._costs[0]):
             costs = list[float]()
             for flown in self.flown:
@@ -260,10 +261,6 @@ class Belief:
                     costs.append(virtual.cost(self.policy_of(flown), episode, explored(flown, episode)))
             self._costs, self._by_noise = (copy.deepcopy(state), costs), {}
         return self._costs[1]
-
-    def _twin_state(self) -> dict[str, Any]:
-        """What the costs on the twin depend on."""
-        return self.virtual.twin.state_dict() | {"noise": self.virtual.twin.noise}
 
     def _beyond_noise(self, k: int) -> float:
         """The paired difference of an episode beyond what other noise of the sensors explains of a large one."""
@@ -416,7 +413,7 @@ class Belief:
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
         twin = self.virtual.twin
-        state = self._twin_state()
+        state = twin.state_dict() | {"noise": twin.noise}
         if self._anchored is None or not equal(state, self._anchored[0]):
             self._anchored = copy.deepcopy(state), self._anchors_on(twin.believed)
         return self._anchored[1]

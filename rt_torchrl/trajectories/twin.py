@@ -71,18 +71,10 @@ class DigitalTwin:
         self._planned: list[_Planned] = []
         self._read: ReadInterval | None = None
         self._correction: Callable[[nn.Module], Tensor] | None = None
-        self._noise = torch.zeros(len(plant.readings), dtype=torch.float64)
+        self.noise: Float[Tensor, " n_r"] = torch.zeros(len(plant.readings), dtype=torch.float64)
+        """Standard deviation of the noise of each sensor; assign what is known."""
         self._noisy: DigitalTwin | None = None
         self._drawn = torch.zeros(0)
-
-    @property
-    def noise(self) -> Float[Tensor, " n_r"]:
-        """Standard deviation of the noise of each sensor; zeros, until somebody sets it."""
-        return self._noise
-
-    @noise.setter
-    def noise(self, levels: Float[Tensor, " n_r"]) -> None:
-        self._noise, self._drawn = levels, torch.zeros(0)
 
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
@@ -195,9 +187,9 @@ class DigitalTwin:
                 self._noisy = self.of(NoisySensors(self.plant))
             batch, n, _ = exogenous.shape
             if self._drawn.shape[:2] != (batch, n):  # the same for every policy
-                drawn = torch.randn(batch, n, len(self.noise), generator=torch.Generator().manual_seed(NOISE_SEED))
-                self._drawn = self.noise * drawn.to(exogenous)
-            inputs = torch.cat([exogenous, self._drawn], -1)
+                generator = torch.Generator().manual_seed(NOISE_SEED)
+                self._drawn = torch.randn(batch, n, len(self.noise), generator=generator).to(exogenous)
+            inputs = torch.cat([exogenous, self.noise * self._drawn], -1)
             return self._noisy.episode_costs(policy, initial_state, inputs, deviation)
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))

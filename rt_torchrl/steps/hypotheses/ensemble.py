@@ -144,8 +144,7 @@ class TwinEnsemble(DigitalTwin):
         """
         twins = [self.twins[name] for name in self._shares]
         for twin in twins:
-            if twin.noise is not self.noise:
-                twin.noise = self.noise
+            twin.noise = self.noise
         flights = ((twin, twin.plant.at_rest(initial_state)) for twin in twins)
         costs = [twin.episode_costs(policy, start, exogenous, deviation) for twin, start in flights]
         return initial_state.new_tensor(list(self._shares.values())) @ torch.stack(costs)
