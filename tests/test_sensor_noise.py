@@ -130,6 +130,13 @@ def test_what_chance_explains_is_said():
     assert "noise of the sensors explains that the episode cost" in noisy.examine()["reason"]
 
 
+def test_noise_excuses_no_fall():
+    belief = believed(2, level=3.0 * LEVELS)
+    last = belief.flown[-1]
+    belief.append(last.trajectory, "model_based", 1e4 * last.cost)
+    assert belief.examine()["alarm"] == 1.0 and belief.unexplained == 5.0
+
+
 def test_plans_and_costs_of_policies_know_the_noise():
     """The gradient is that of finite differences, and a gain that makes noise dear is cheaper only without it."""
     plant, soft, hard = LinearQuadratic(horizon=10.0, noise=0.0), LinearGain([[0.3, 0.3]]), LinearGain([[1.5, 1.5]])

@@ -263,9 +263,12 @@ class Belief:
         return self._costs[1]
 
     def _beyond_noise(self, k: int) -> float:
-        """The paired difference of an episode beyond what other noise of the sensors explains of a large one."""
+        """The paired difference of an episode beyond what other noise of the sensors explains of a large one.
+
+        Noise excuses no fall: the greatest difference that counts stays as it is.
+        """
         d = self.differences()[k]
-        if math.isnan(d) or abs(d) <= NOISE:
+        if not NOISE < abs(d) < DEARER:
             return d
         if k not in self._by_noise:
             try:
