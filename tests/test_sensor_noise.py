@@ -5,6 +5,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
 from rt_torchrl import ClassicalController, DigitalTwin, ExogenousConfig
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
@@ -174,7 +175,7 @@ class Proportional(ClassicalController):
 
 
 def test_unseen_episodes_on_the_twin_meet_the_noise_of_the_sensors():
-    """Policies, controllers with a memory and predictive control read it, and costs are those of readings."""
+    """Policies and controllers with a memory read it, and costs are those of readings."""
     plant = LinearQuadratic(horizon=5.0, noise=0.0)
     twin = DigitalTwin(plant, plant.closure)
     unseen = TwinEpisodes(twin, plant, 200)
@@ -200,3 +201,18 @@ def test_unseen_episodes_on_the_twin_meet_the_noise_of_the_sensors():
     jumps = noisy.states[:, 1:] - noisy.states[:, :-1]
     assert jumps[..., 1].std() > LEVELS[1]  # of readings, and not of states
     assert unseen.judge(noisy).control_costs.tolist() == pytest.approx(costs.tolist())
+
+
+def test_predictive_control_plans_from_readings_with_noise():
+    plant = LinearQuadratic(horizon=2.0, noise=0.0)
+    twin = DigitalTwin(plant, plant.closure)
+    unseen = TwinEpisodes(twin, plant, 2)
+    controller = PredictiveControl(plant, plant.closure, PredictiveConfig(horizon=1.0))
+    controller.learn(unseen.exogenous)
+    quiet = unseen.fly(controller).actions
+    twin.noise = LEVELS
+    noisy = unseen.fly(controller)
+    assert noisy.exogenous.shape == unseen.exogenous.shape and (noisy.actions - quiet).abs().amax() > 0.01
+    # The first command is that of the first reading.
+    first = controller.fly(noisy.states[:, 0], unseen.exogenous).actions[:, 0]
+    torch.testing.assert_close(noisy.actions[:, 0], first)

@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -219,7 +218,6 @@ class TwinEpisodes(UnseenEpisodes):
     def __init__(self, twin: DigitalTwin, plant: Plant, count: int = 20, *, device: torch.device | str = "cpu"):
         super().__init__(plant, count, device=device)
         self.closure, self._twin = None, twin
-        self._noisy: DigitalTwin | None = None
 
     @property
     def flying(self) -> Plant:
@@ -232,12 +230,10 @@ class TwinEpisodes(UnseenEpisodes):
         levels = self._twin.noise
         if not levels.any():
             return self._controlled(twin, policy, start, self.exogenous)
-        if self._noisy is None or self._noisy.closure is not twin.closure:  # kept with its code
-            self._noisy = twin.of(NoisySensors(twin.plant))
         count, n, _ = self.exogenous.shape
         generator = torch.Generator(device=start.device).manual_seed(UNSEEN_SEED)
         noise = levels * torch.randn(count, n + 1, len(levels), generator=generator, dtype=torch.float64)
-        flown = self._controlled(self._noisy, policy, start, torch.cat([self.exogenous, noise[:, :-1]], -1))
+        flown = self._controlled(twin.noisy, policy, start, torch.cat([self.exogenous, noise[:, :-1]], -1))
         noise = torch.where(twin.plant.ended(flown.states).unsqueeze(-1), 0.0, noise)  # so that what has ended has
         readings = flown.states + functional.pad(noise, (0, flown.states.shape[-1] - noise.shape[-1]))
         return Trajectory(readings, flown.actions, self.exogenous)

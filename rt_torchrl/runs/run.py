@@ -17,13 +17,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
-from rt_torchrl.evaluation.unseen import (
-    Baseline,
-    Judged,
-    RealController,
-    RealEpisodes,
-    mean_with_confidence,
-)
+from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, mean_with_confidence
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant

@@ -111,7 +111,7 @@ class Assimilation:
         before, progress = copy.deepcopy(self.twin.closure.state_dict()), copy.deepcopy(self._progress())
         descended, config = self._fit(whole), self.config
         chooses = config.initial is None and (config.method, config.inputs) == ESTIMABLE
-        if chooses and not self.estimates and self._noisy(records):
+        if chooses and not self.estimates and self._noisy(whole):
             self._estimate_first_states(True)
             self.twin.closure.load_state_dict(before)
             self._resume(progress)
@@ -121,14 +121,14 @@ class Assimilation:
                 self.twin.noise = noise_levels(self.twin, records)
         return descended
 
-    def _noisy(self, records: Sequence[Trajectory]) -> bool:
+    def _noisy(self, whole: Trajectory) -> bool:
         """Whether the sensors have noise, as the present twin tells; not asked where errors are tiny."""
         sensors = self._problem.sensors
-        scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, batch_of(records)))
-        if (self._rms(self.in_segments(batch_of(records))) <= SURE * EXPLAINED * scatter).all():
+        scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, whole))
+        if (self._rms(self.in_segments(whole)) <= SURE * EXPLAINED * scatter).all():
             return False
         with contextlib.suppress(FloatingPointError):
-            return bool(noise_levels(self.twin, records).any())
+            return bool(noise_levels(self.twin, whole.each()).any())
         return False
 
     def _fit(self, whole: Trajectory) -> Descended:
@@ -309,14 +309,8 @@ class Assimilation:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return (
-            self._progress()
-            | {"first": self.first, "length": self.length}
-            | {
-                "estimates": self.estimates,
-                "noise": self.twin.noise,
-            }
-        )
+        problem = {"first": self.first, "length": self.length, "estimates": self.estimates, "noise": self.twin.noise}
+        return self._progress() | problem
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._resume(state)

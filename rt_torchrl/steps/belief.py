@@ -37,7 +37,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils._pytree import tree_flatten
 
-from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.config import Role
@@ -138,7 +137,7 @@ class Belief:
         self._costs: tuple[Any, list[float]] | None = None
         self._by_noise = dict[int, tuple[float, float]]()
         self._anchored: tuple[Any, Anchors | None] | None = None
-        self._twins = dict[tuple[DigitalTwin, type[Anchored | NoisySensors]], DigitalTwin]()
+        self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
         virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
 
@@ -262,12 +261,11 @@ class Belief:
             self._costs, self._by_noise = (copy.deepcopy(state), costs), {}
         return self._costs[1]
 
-    def _beyond_noise(self, k: int) -> float:
-        """The paired difference of an episode beyond what other noise of the sensors explains of a large one.
+    def _beyond_noise(self, k: int, d: float) -> float:
+        """The paired difference d of an episode beyond what other noise of the sensors explains of a large one.
 
         Noise excuses no fall: the greatest difference that counts stays as it is.
         """
-        d = self.differences()[k]
         if not NOISE < abs(d) < DEARER:
             return d
         if k not in self._by_noise:
@@ -296,19 +294,12 @@ class Belief:
         noise[1:] = levels * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
         true_starts = twin.plant.at_rest(starts - noise[:, 0])  # of which the readings are those of the episode
         scenario = Scenario(true_starts, torch.cat([inputs.expand(len(noise), -1, -1), noise], -1))
-        costs = self._twin_of(twin, NoisySensors).episode_costs(policy, *scenario, explored(flown, scenario))
+        costs = twin.noisy.episode_costs(policy, *scenario, explored(flown, scenario))
         episode = Scenario(twin.plant.at_rest(starts), inputs)
         logs = (costs / twin.episode_costs(policy, *episode, explored(flown, episode))).log()
         mean, spread = logs[1:].mean().item(), 2.0 * logs[1:].std().item()
         ends = (0.0, logs[0].item(), mean - spread, mean + spread)
         return (min(ends), max(ends)) if all(map(math.isfinite, ends)) else (0.0, 0.0)
-
-    def _twin_of(self, twin: DigitalTwin, kind: type[Anchored | NoisySensors]) -> DigitalTwin:
-        """A twin of the plant of this kind around that of a twin, under its closure, which keeps its code."""
-        kept = self._twins.get((twin, kind))
-        if kept is None or kept.closure is not twin.closure:
-            kept = self._twins[twin, kind] = twin.of(kind(twin.plant))
-        return kept
 
     def examine(self) -> TensorDict:
         """Fly the latest real episodes on the present twin.
@@ -321,16 +312,13 @@ class Belief:
         differences = self.differences()
         if not differences or math.isnan(differences[-1]) or not self._policy_flew:
             return metrics()
-        known = [k for k, d in enumerate(differences) if not math.isnan(d)]
-        beyond_noise = [self._beyond_noise(k) for k in known[-2:]]
+        known = [(k, d) for k, d in enumerate(differences) if not math.isnan(d)]
+        beyond_noise = [self._beyond_noise(k, d) for k, d in known[-2:]]
         warning, hypothesis = alarm(beyond_noise), self.virtual.twin.hypothesis
-        reasons = []
+        report = metrics(paired_difference=differences[-1], alarm=float(warning is not None))
         if abs(differences[-1]) > ALARM and beyond_noise[-1] == 0.0:
-            ratio = math.exp(differences[-1])
-            reasons = [
-                f"noise of the sensors explains that the episode cost {ratio:.3g} times what the twin says of it"
-            ]
-        report = metrics(*reasons, paired_difference=differences[-1], alarm=float(warning is not None))
+            cost = f"{math.exp(differences[-1]):.3g} times what the twin says of it"
+            report.set_non_tensor("reason", f"noise of the sensors explains that the episode cost {cost}")
         if warning is None:
             return report
         explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
@@ -344,7 +332,7 @@ class Belief:
         differences = self.differences()
         if not differences or math.isnan(differences[-1]):
             return 0.0
-        return abs(self._beyond_noise(len(differences) - 1))
+        return abs(self._beyond_noise(len(differences) - 1, differences[-1]))
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory], n: int) -> float:
@@ -411,7 +399,7 @@ class Belief:
     @property
     def contradicted(self) -> bool:
         """Whether an episode cost other than the present twin says, beyond what noise of the sensors explains."""
-        return any(abs(self._beyond_noise(k)) > NOISE for k in range(len(self.flown)))
+        return any(abs(self._beyond_noise(k, d)) > NOISE for k, d in enumerate(self.differences()))
 
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
@@ -436,9 +424,12 @@ class Belief:
                 differences.append(d)
         if not whole:
             return None
+        anchored = self._twins.get(twin)
+        if anchored is None or anchored.closure is not twin.closure:
+            anchored = self._twins[twin] = twin.of(Anchored(twin.plant))
         replays = AnchoredReplays(
             self.virtual.twin,
-            self._twin_of(twin, Anchored),
+            anchored,
             [flown.trajectory for flown in whole],
             torch.cat(inputs),
             torch.tensor([flown.cost for flown in whole], dtype=torch.float64, device=inputs[0].device),

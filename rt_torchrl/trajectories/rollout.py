@@ -160,6 +160,11 @@ class Rollout:
                 f"plant {plant.name!r} is rolled out "
                 + ("without a policy: pass command." if command is None else "with a policy: pass no command.")
             )
+        if deviation is not None and self.interval.policy is None:
+            raise ValueError(
+                f"deviation of plant {plant.name!r} is added to the commands of a policy, and there is none: pass it "
+                "in command."
+            )
         for argument, actions in (("command", command), ("deviation", deviation)):
             if actions is not None:
                 expected[argument] = (actions, (batch, n, len(plant.actions)))

@@ -183,14 +183,12 @@ class DigitalTwin:
             deviation: what is added to the commands of a policy that is no state feedback; None for nothing.
         """
         if self.noise.any():
-            if self._noisy is None or self._noisy.closure is not self.closure:  # kept with its code
-                self._noisy = self.of(NoisySensors(self.plant))
             batch, n, _ = exogenous.shape
             if self._drawn.shape[:2] != (batch, n):  # the same for every policy
                 generator = torch.Generator().manual_seed(NOISE_SEED)
                 self._drawn = torch.randn(batch, n, len(self.noise), generator=generator).to(exogenous)
             inputs = torch.cat([exogenous, self.noise * self._drawn], -1)
-            return self._noisy.episode_costs(policy, initial_state, inputs, deviation)
+            return self.noisy.episode_costs(policy, initial_state, inputs, deviation)
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))
         return self._planning(policy).costs(initial_state, exogenous, deviation=deviation)
@@ -207,6 +205,13 @@ class DigitalTwin:
         """What is expected on the real system of :meth:`episode_costs`, differentiable as these are."""
         costs = self.episode_costs(policy, initial_state, exogenous)
         return costs if self._correction is None else costs * self._correction(policy).exp()
+
+    @property
+    def noisy(self) -> "DigitalTwin":
+        """The twin whose inputs hold noise of the sensors, which keeps its code: :class:`NoisySensors`."""
+        if self._noisy is None or self._noisy.closure is not self.closure:
+            self._noisy = self.of(NoisySensors(self.plant))
+        return self._noisy
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
