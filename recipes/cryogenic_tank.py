@@ -1,7 +1,6 @@
 """Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, Literal
 
 import rt_torchrl as rt
@@ -9,9 +8,6 @@ import rt_torchrl as rt
 if __name__ == "__main__":
     rt.begin_loading()
 
-from torch import nn
-
-from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.cryogenic_tank.unknown import unknown
@@ -84,7 +80,6 @@ class Config(rt.RunConfig):
             end.
         horizon: length of an episode T_o [s].
         fluid: pure fluid in the tank: Hydrogen, ParaHydrogen, Nitrogen, Oxygen or Methane.
-        model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
         unknown: what the real system has beside its twin, one or more of bias_5, bias_15, bias_minus_15, drift_10,
             drift_25 (of the pressure sensor), valve_lag and all; docs/unknown_systems.md describes them.
     """
@@ -99,7 +94,6 @@ class Config(rt.RunConfig):
     closure: Literal["paper", "mlp"] = "paper"
     horizon: float = 4.32e5
     fluid: str = "Hydrogen"
-    model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
     twinning: rt.TwinningConfig = DEFAULT
@@ -109,8 +103,6 @@ class Config(rt.RunConfig):
         CryogenicTank.chosen(self.observe)
         self.cost()
         unknown.changes(self.unknown)  # which refuses what does not go together
-        if self.unknown and self.model_error:
-            raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"
         if planned and self.command != "duty":
             raise ValueError(
@@ -145,20 +137,6 @@ class Config(rt.RunConfig):
     def cost(self) -> PressureCost:
         """The cost that the options ask for."""
         return PressureCost(vented=self.vented_weight, end=self.end_weight)
-
-    def wear(self, plant: CryogenicTank) -> Callable[[int], nn.Module] | None:
-        if not self.model_error:
-            return None
-        worn = ConstantCoefficients.true()
-
-        def fouled(episode: int) -> ConstantCoefficients:
-            # The weights change in place, because a new module for each episode would be compiled anew.
-            U_s, U_HX, K_JT = ConstantCoefficients.true_coefficients
-            fresh = worn.log_coefficients.new_tensor([U_s, 0.98**episode * U_HX, K_JT])
-            worn.log_coefficients.copy_(fresh.log())
-            return worn
-
-        return fouled
 
     def plant_figures(self, snapshot):
         from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib

@@ -9,7 +9,7 @@ if __name__ == "__main__":
     rt.begin_loading()
 
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.flapping_wing.unknown import unknown
 from rt_torchrl.options import Text
 
@@ -77,8 +77,6 @@ NEURAL = dataclasses.replace(
 
 OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
 """What each kind of policy observes by default."""
-MASS, BELIEVED = 3e-3, 2.25e-3
-"""Mass of the body [kg], and the mass that the twin believes with ``--model-error``."""
 TARGETS = {"paper": (5.0, 5.0), "hop": (1.0, 1.0)}
 """Target (x_f, z_f) of each task [m]."""
 
@@ -94,8 +92,6 @@ class Config(rt.RunConfig):
             these), or names such as headwind; by default measured+wind for mlp, and else paper.
         task: where the drone flies to: paper (5 m forwards and upwards), or hop (1 m forwards and upwards).
         horizon: length of an episode T_o [s].
-        peak: height of the window of J_a around the target: unit, or printed as in the paper.
-        model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
         unknown: what the real system has beside its twin, one or more of plane_4.4, plane_6.3, plane_12.6 (slow stroke
             planes), delay, sag, all_1 and all_2; docs/unknown_systems.md describes them.
     """
@@ -107,8 +103,6 @@ class Config(rt.RunConfig):
     task: Literal["paper", "hop"] = "paper"
     horizon: float = 5.0
     observe: tuple[str, ...] = ()
-    peak: Literal["unit", "printed"] = "unit"
-    model_error: bool = False
     unknown: tuple[str, ...] = ()
     unseen: int = 100
     twinning: rt.TwinningConfig = DEFAULT
@@ -116,10 +110,7 @@ class Config(rt.RunConfig):
     def __post_init__(self):
         super().__post_init__()
         FlappingWing.chosen(self.observe)
-        TrackingCost(peak=self.peak)
         unknown.changes(self.unknown)  # which refuses what does not go together
-        if self.unknown and self.model_error:
-            raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
 
     def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         return super().presets() | {
@@ -129,23 +120,19 @@ class Config(rt.RunConfig):
         }
 
     def plant(self) -> rt.Plant:
-        return unknown(self.drone(MASS), self.unknown)
+        return unknown(self.drone(), self.unknown)
 
-    def drone(self, mass: float) -> FlappingWing:
-        """The drone as its twin knows it, with a body of this mass [kg]."""
+    def drone(self) -> FlappingWing:
+        """The drone as its twin knows it."""
         return FlappingWing(
             horizon=self.horizon,
             target=TARGETS[self.task],
-            cost=TrackingCost(peak=self.peak),
-            mass=mass,
             observe=self.observe or ("paper" if self.preset == "paper" else OBSERVED[self.policy],),
         )
 
     def believed(self) -> FlappingWing | None:
-        """The physics of a twin that is wrong about them, or does not know all; None if it is right."""
-        if self.unknown:
-            return self.drone(MASS)
-        return self.drone(BELIEVED) if self.model_error else None
+        """The physics of a twin that does not know what the real drone has beside them."""
+        return self.drone() if self.unknown else None
 
     def plant_figures(self, snapshot):
         from rt_torchrl.envs.flapping_wing import figures  # here, because an episode need not wait for Matplotlib

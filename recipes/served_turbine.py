@@ -50,8 +50,8 @@ class Config(Turbine):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.real != "simulation" or self.unknown or self.model_error:
-            raise ValueError("real, unknown and model_error are other real systems; take recipes/wind_turbine.py.")
+        if self.real != "simulation" or self.unknown:
+            raise ValueError("real and unknown are other real systems; take recipes/wind_turbine.py.")
 
 
 class ServedPlant:

@@ -1,7 +1,6 @@
 """Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import field
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,6 @@ from torch import nn
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
 from rt_torchrl.envs.wind_turbine.disturbances import RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
-from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.unknown import unknown
 from rt_torchrl.options import Text
@@ -76,7 +74,6 @@ class Config(rt.RunConfig):
         dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         wind_files: TurbSim files (.hh or .bts) from which the wind is drawn instead.
-        model_error: wear the rotor from the middle of the training on, with 10 % less lift and 50 % more drag.
         unknown: what the real system has beside its twin, one or more of anemometer_low, anemometer_high, torque_loss,
             inflow, pitch and all; docs/unknown_systems.md describes them.
         real: real system: simulation of the plant, or rosco for the simulator of NREL's ROSCO toolbox. With rosco,
@@ -94,7 +91,6 @@ class Config(rt.RunConfig):
     dt: float = 0.5
     horizon: float = 600.0
     wind_files: tuple[Path, ...] = ()
-    model_error: bool = False
     unknown: tuple[str, ...] = ()
     real: Literal["simulation", "rosco"] = "simulation"
     twinning: rt.TwinningConfig = DEFAULT
@@ -105,9 +101,8 @@ class Config(rt.RunConfig):
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
         unknown.changes(self.unknown)  # which refuses what does not go together
-        if self.unknown and (self.model_error or self.real == "rosco"):
-            other = "model_error" if self.model_error else "real='rosco'"
-            raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")
+        if self.unknown and self.real == "rosco":
+            raise ValueError(f"unknown={self.unknown} does not go with real='rosco', another real system; give one.")
 
     def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         paper = {"policy": "paper", "start": "random", "twinning": PAPER_T1}
@@ -138,12 +133,6 @@ class Config(rt.RunConfig):
         if self.policy == "bias":
             return plant.make_policy(generator, bias=True)
         return super().make_policy(plant, generator)
-
-    def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
-        if not self.model_error:
-            return None
-        worn, middle = PowerCoefficientTable.nrel5mw(worn=True), self.effective().episodes // 2
-        return lambda episode: plant.closure if episode < middle else worn
 
     def plant_figures(self, snapshot):
         from rt_torchrl.envs.wind_turbine import figures  # here, because an episode need not wait for Matplotlib

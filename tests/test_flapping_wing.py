@@ -10,7 +10,7 @@ from scipy.optimize import fsolve
 from seeds_and_numbers import double, seeded
 
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.trajectories.rollout import Rollout
 
 # Oracle for the forces of the flapping wing: the paper's formulas read literally, in numpy.
@@ -160,17 +160,15 @@ def test_observation_is_the_scaled_error(plant):
 
 
 @pytest.mark.parametrize(
-    "state, peak, cost",
+    "state, cost",
     [
-        ((0.0, 0.0, 2.0, 3.0), "unit", 25.0),  # seven σ away: no weight on the velocity
-        ((5.0, 5.0, 1.0, 2.0), "unit", 2.5),
-        ((5.0, 5.0, 1.0, 2.0), "printed", 2.5 * 12.5**2),
-        ((5.71, 5.0, 1.0, 0.0), "unit", 0.5 * (0.71**2 + math.exp(-1.0))),
-        ((5.0, 4.29, 1.0, 2.0), "unit", 0.5 * (0.71**2 + 1.0 + 4.0 * math.exp(-1.0))),
+        ((0.0, 0.0, 2.0, 3.0), 25.0),  # seven σ away: no weight on the velocity
+        ((5.0, 5.0, 1.0, 2.0), 2.5),
+        ((5.71, 5.0, 1.0, 0.0), 0.5 * (0.71**2 + math.exp(-1.0))),
+        ((5.0, 4.29, 1.0, 2.0), 0.5 * (0.71**2 + 1.0 + 4.0 * math.exp(-1.0))),
     ],
 )
-def test_cost(state, peak, cost):
-    plant = FlappingWing(cost=TrackingCost(peak=peak))
+def test_cost(plant, state, cost):
     value = plant.running_cost(double(0.0).squeeze(), double(*state), double(70.0, 0.0), double(1.0))
     assert value.item() == pytest.approx(cost, rel=1e-12)
 

@@ -44,9 +44,7 @@ def combinations():
 
 @pytest.mark.parametrize(("plant", "closure", "policy"), list(combinations()))
 def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, tmp_path):
-    options = {"policy": policy, "closure": closure, "hidden": (3,)}
-    options |= {"horizon": 3000.0} | ({} if plant == "pendulum" else {"model_error": True})
-    config, parts = leave_run(tmp_path, plant, **options)
+    config, parts = leave_run(tmp_path, plant, policy=policy, closure=closure, hidden=(3,), horizon=3000.0)
     run = load_run(tmp_path)
     assert run.config == config and set(run.policies) == {"model_based", "model_free"} and run.plant.horizon == 3000.0
     for role, part in parts.items():
@@ -57,7 +55,6 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
 
 CHOICES = {
     "wind_turbine": {"observe": ("preview", "speed_rate"), "task": "engineering", "horizon": 10.0},
-    "flapping_wing": {"observe": ("phase",), "peak": "printed", "horizon": 0.05},
     "cryogenic_tank": {"observe": ("measured+load",), "command": "duty", "end_weight": 7200.0, "horizon": 3000.0},
 }
 

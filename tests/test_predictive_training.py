@@ -113,7 +113,7 @@ ALWAYS = (
         ("wind_turbine", "--horizon 20 --policy scheduled"),
         (
             "flapping_wing",
-            "--horizon 0.2 --twinning.planner.receding-horizon.horizon 1 --model-error --observe phase --noise 0.001",
+            "--horizon 0.2 --twinning.planner.receding-horizon.horizon 1 --observe phase --noise 0.001",
         ),
         ("cryogenic_tank", "--horizon 7200 --command duty"),
     ],

@@ -3,7 +3,6 @@ r"""The flapping-wing micro air vehicle as a plant: a point mass under two beati
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
 
 import numpy as np
 import torch
@@ -83,28 +82,24 @@ class TrackingCost:
 
     .. math::
         L_a = \tfrac12\big(\|e\|^2 + \alpha_1\|\dot e\circ h\|^2\big), \qquad
-        h_i = \hat h_i\exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
+        h_i = \exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
 
     with the position error e (paper, eq. drone_eq_rewardCont).
 
     Note: the paper prints a peak ĥ of x_f²/2; here it is 1, because its text calls the function unitary.
-    ``peak="printed"`` gives the printed peak.
 
     Args:
         velocity: weight α1 of the speed near the target.
-        peak: height of the Gaussian window h: 1, or the printed x_f²/2.
 
     Raises:
-        ValueError: if a weight is negative, or the peak is unknown.
+        ValueError: if the weight is negative.
     """
 
     velocity: NotNegative = 1.0
-    peak: Literal["unit", "printed"] = "unit"
 
     def __call__(self, plant: "FlappingWing", t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         e = plant.target - state[..., :2]
-        peak = 1.0 if self.peak == "unit" else 0.5 * plant.target**2
-        h = peak * torch.exp(-0.5 * (e / WINDOW_WIDTH) ** 2)
+        h = torch.exp(-0.5 * (e / WINDOW_WIDTH) ** 2)
         return 0.5 * ((e**2).sum(-1) + self.velocity * ((state[..., 2:4] * h) ** 2).sum(-1))
 
 

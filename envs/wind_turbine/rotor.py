@@ -99,13 +99,9 @@ class PowerCoefficientTable(nn.Module):
         return cls(body[:, 0], pitch, body[:, 1:])
 
     @classmethod
-    def nrel5mw(cls, *, worn: bool = False) -> "PowerCoefficientTable":
-        """The NREL 5-MW rotor by blade-element momentum, λ 2…14.5, β -5…30 deg; ``data/NOTICE.md`` names the source.
-
-        Args:
-            worn: whether the blades have lost 10 % of their lift and gained 50 % of drag.
-        """
-        return cls.from_csv(DATA / ("nrel5mw_Cp_table_worn.csv" if worn else "nrel5mw_Cp_table_rosco.csv"))
+    def nrel5mw(cls) -> "PowerCoefficientTable":
+        """The NREL 5-MW rotor by blade-element momentum, λ 2…14.5, β -5…30 deg; ``data/NOTICE.md`` names the source."""
+        return cls.from_csv(DATA / "nrel5mw_Cp_table_rosco.csv")
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
         """C_p [-] at the features, tip-speed ratio λ [-] and pitch β [deg], in the module's dtype (float64)."""
