@@ -488,29 +488,17 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
         arguments: tensors, and tuples of tensors, for several realisations, no two of which are equal.
 
     Raises:
-        ImpureError: if a second answer is another one, although none but other questions were asked in between; if a
-            question changes a buffer; or if the answer for a realisation depends on the others.
+        ImpureError: if a second answer or buffer is another one, although none but other questions were asked in
+            between; or if the answer for a realisation depends on the others.
     """
-    strided = {name: x for name, x in module.named_buffers() if x.layout is torch.strided}
-    copies = {name: x.clone() for name, x in strided.items()}
     answers = _answers(module, arguments)
     module(*tree_map(lambda x: x[-1:].expand_as(x).clone(), arguments))
-    again = _answers(module, arguments)
-    changed = [name for name, x in strided.items() if not torch.allclose(x, copies[name], 0, 0, equal_nan=True)]
-    with torch.no_grad():
-        for name in changed:
-            strided[name].copy_(copies[name])
-    if changed:
-        owner, _, buffer = changed[0].rpartition(".")
-        raise ImpureError(f"{_called(module, owner)} changes its buffer {buffer!r} when it is called. {PURE}.")
-    first = answers[-1].answer[0]  # of the module itself
-    if not _equal([first], again[-1].answer):
-        pairs = zip(answers, again, strict=False)
-        culprit = next((a.module for a, b in pairs if a.same_question(b) and not _equal(a.answer, b.answer)), module)
-        path = next(path for path, submodule in module.named_modules() if submodule is culprit)
-        raise ImpureError(
-            f"{_called(module, path)} gives something else when it is called again with the same arguments. {PURE}."
-        )
+    for (part, asked, answer), (_, asked_again, other) in zip(answers, _answers(module, arguments), strict=False):
+        if (part is module or _equal(asked, asked_again)) and not _equal(answer, other):
+            raise ImpureError(
+                f"{_called(module, part)} gives something else when it is called again with the same arguments. {PURE}."
+            )
+    first = answers[-1][2][0]  # of the module itself
     for row in (slice(-1, None), slice(1)):  # a loop may run until one of both has converged
         try:
             alone = module(*tree_map(operator.itemgetter(row), arguments)).detach()
@@ -527,25 +515,13 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
             )
 
 
-class _Answer(NamedTuple):
-    """What a module was asked, and what it answered."""
+def _answers(module: nn.Module, arguments: tuple[Any, ...]) -> list[tuple[nn.Module, list[Tensor], list[Tensor]]]:
+    """A module and those within it, the inner ones first: what they were asked, their answers and their buffers."""
+    answers, here = list[tuple[nn.Module, list[Tensor], list[Tensor]]](), threading.get_ident()
 
-    module: nn.Module
-    arguments: list[Tensor]
-    answer: list[Tensor]
-
-    def same_question(self, other: "_Answer") -> bool:
-        return self.module is other.module and _equal(self.arguments, other.arguments)
-
-
-def _answers(module: nn.Module, arguments: tuple[Any, ...]) -> list[_Answer]:
-    """The answers of a module and of those within it, of which the inner ones come first."""
-    answers, here = list[_Answer](), threading.get_ident()
-
-    def note(submodule: nn.Module, args: object, answer: object) -> None:
+    def note(part: nn.Module, asked: object, answer: object) -> None:
         if threading.get_ident() == here:
-            tensors = ([x.detach().clone() for x in tree_leaves(xs) if isinstance(x, Tensor)] for xs in (args, answer))
-            answers.append(_Answer(submodule, *tensors))
+            answers.append((part, _copies(asked), _copies((answer, list(part.buffers(recurse=False))))))
 
     handle = register_module_forward_hook(note)
     try:
@@ -553,6 +529,11 @@ def _answers(module: nn.Module, arguments: tuple[Any, ...]) -> list[_Answer]:
     finally:
         handle.remove()
     return answers
+
+
+def _copies(values: object) -> list[Tensor]:
+    tensors = (x for x in tree_leaves(values) if isinstance(x, Tensor) and x.layout is torch.strided)
+    return [x.detach().double().clone() for x in tensors]
 
 
 def _equal(some: list[Tensor], others: list[Tensor]) -> bool:
@@ -566,10 +547,10 @@ def _equal(some: list[Tensor], others: list[Tensor]) -> bool:
     return [x.shape for x in some] == [y.shape for y in others] and all(map(close, some, others))
 
 
-def _called(module: nn.Module, path: str) -> str:
+def _called(module: nn.Module, part: nn.Module) -> str:
     """A part of an interval in words; the interval itself is what its plant makes of it."""
-    short = path.replace("interval.", "")
-    if short in ("", "interval"):
+    path = next((path.replace("interval.", "") for path, submodule in module.named_modules() if submodule is part), "")
+    if path in ("", "interval"):
         plant = next((submodule for name, submodule in module.named_modules() if name.endswith("plant")), None)
         return f"a method of plant {getattr(plant, 'name', type(module).__name__)!r}"
-    return f"{short} ({type(module.get_submodule(path)).__name__})"
+    return f"{path} ({type(part).__name__})"
