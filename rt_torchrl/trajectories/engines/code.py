@@ -4,9 +4,9 @@ import ctypes
 import os
 import threading
 import warnings
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
 from itertools import accumulate, chain, islice
 from typing import Any, NamedTuple
@@ -33,18 +33,12 @@ AGREEMENT = 1e-8
 ROUNDING = 1e-13
 """Greatest difference of gradients by weights, relative to the largest of all gradients: behind a saturated function,
 such as 1 − tanh², nothing is left of a gradient but its rounding."""
-TRIES = 3
-"""Number of points without a number by torch after which an interval is left to torch."""
 KEPT = 256
 """Number of kinds of intervals whose machine code is kept."""
 ROWS = 8
 """Least number of realisations with which an interval is asked whether it is a function of each alone."""
 NUDGE = 1e-3
 """Relative change of the signals of a point, so that no two rows are equal."""
-
-
-class UncomparedError(UntraceableError):
-    """Where torch finds no numbers, machine code has nothing to be compared with."""
 
 
 class Inputs:
@@ -60,18 +54,13 @@ class Inputs:
         self.sizes = [w.numel() for w in self.learned]
 
     @cached_property
-    def _places(self) -> list[tuple[np.ndarray, int]]:
-        """Their numbers in the memory of each, and where these end in a row."""
-        ends = accumulate(w.numel() for w in self._all)
-        return [(w.detach().numpy(), end) for w, end in zip(self._all, ends, strict=True)]
+    def _arrays(self) -> list[np.ndarray]:
+        """Their numbers in the memory of each."""
+        return [w.detach().numpy() for w in self._all]
 
-    def row(self, indices: Iterable[int] | None = None) -> np.ndarray:
-        """The present numbers of all of them as one row, or of those that are read."""
-        numbers = np.empty(max([1, *(end for _, end in self._places)]))
-        for k in range(len(self._all)) if indices is None else indices:
-            x, end = self._places[k]
-            numbers[end - x.size : end] = x.ravel()
-        return numbers
+    def row(self) -> np.ndarray:
+        """The present numbers of all of them as one row."""
+        return np.concatenate([np.empty(0), *(x.ravel() for x in self._arrays)])
 
     def split(self, gradients: np.ndarray) -> list[Tensor]:
         """A row of gradients by the learned weights, in their own shapes."""
@@ -121,22 +110,10 @@ def signals_of(drive: Iterable[Tensor]) -> np.ndarray:
 
 def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> None:
     """Do the work of every group, on as many threads as torch may use; whoever is free takes the next group."""
-    starts = range(0, batch, lanes)
-    groups = iter([Group(first, min(first + lanes, batch), lanes) for first in starts])
-
-    def share() -> None:
-        for group in groups:
-            work(group)
-
-    others = min(torch.get_num_threads(), len(starts)) - 1
-    helping = [_pool(others).submit(share) for _ in range(others)]
-    try:
-        share()
-    finally:  # nobody may still write into the arrays of a call that has ended
-        if helping:
-            wait(helping)
-    for thread in helping:
-        thread.result()  # raises what it raised
+    groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
+    threads = min(torch.get_num_threads(), len(groups))
+    for _ in _pool(threads).map(work, groups) if threads > 1 else map(work, groups):
+        pass  # which raises what it raised
 
 
 @cache
@@ -220,8 +197,6 @@ class IntervalCode:
         if end.shape != state.shape:
             raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
         self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        self.read_inputs = _read_by(tracer, interval, tracer.outputs(end))
-        """Numbers of the inputs that the code reads, of which a large table may not be one."""
         self.march = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
         x, start = point.in_lanes()
         states = np.concatenate([start, start])
@@ -256,7 +231,6 @@ class IntervalCode:
         values = map(tracer.outputs, gradients)
         outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
         code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
-        self.read_inputs |= _read_by(tracer, interval, chain.from_iterable(outputs))
         self._compare_sweep(code, interval, driven)
         self.outside = outside_of(interval, holdings or Holdings(interval), self._executed)
         self.sweeps[driven] = code
@@ -267,17 +241,15 @@ class IntervalCode:
         by_state, by_drive = costate.copy(), np.zeros((1, self.sizes["x"], self.lanes.number))
         by_weights = np.zeros((sum(inputs.sizes), self.lanes.number))
         sweep(*x, states, np.zeros_like(states), 0, by_state, inputs.row(), by_drive, by_weights, 1)
-        rows = torch.ones(len(self.point.state), dtype=torch.bool)
-        exact = self._expected(interval, inputs, rows, costate)
-        finite = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
-        if not finite.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
-            rows = finite
-            if not rows.any():
-                raise UncomparedError(
-                    f"torch has no finite gradient of an interval from the state {self.point.state[0].tolist()}. A "
-                    "branch of torch.where that is not taken may have none: give it an argument for which it has one, "
-                    "torch.sqrt(torch.where(x > 0, x, 1)) in the place of torch.sqrt(x)"
-                )
+        exact = self._expected(interval, inputs, torch.ones(len(self.point.state), dtype=torch.bool), costate)
+        rows = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
+        if not rows.any():
+            raise UntraceableError(
+                f"torch has no finite gradient of an interval from the state {self.point.state[0].tolist()}. A "
+                "branch of torch.where that is not taken may have none: give it an argument for which it has one, "
+                "torch.sqrt(torch.where(x > 0, x, 1)) in the place of torch.sqrt(x)"
+            )
+        if not rows.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
             exact = self._expected(interval, inputs, rows, costate)
         at = rows.numpy()
         computed = [by_state.T[at], by_drive[0].T[at] if driven else exact[1]]
@@ -304,15 +276,12 @@ def require_equal(what: str, computed: np.ndarray, exact: np.ndarray, scale: np.
 
     Raises:
         UntraceableError: if a number differs by more than :data:`AGREEMENT` of the largest finite number of its column.
-        UncomparedError: if it differs only where torch finds no numbers.
     """
     sizes = np.abs(np.where(np.isfinite(exact), exact, 0.0)) + np.abs(np.where(np.isfinite(scale), scale, 0.0))
     equal = np.isclose(computed, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
-    wrong = ~equal & np.isfinite(exact) if (~equal & np.isfinite(exact)).any() else ~equal
-    if wrong.any():
-        kind = UntraceableError if np.isfinite(exact[wrong]).all() else UncomparedError
-        raise kind(
-            f"{what} differs from what torch computes, for example {computed[wrong][0]} instead of {exact[wrong][0]}. "
+    if not equal.all():
+        raise UntraceableError(
+            f"{what} differs from what torch computes, such as {computed[~equal][0]} instead of {exact[~equal][0]}. "
             "A number has left torch where tracing cannot follow it, such as by .numpy(), or torch itself is inexact, "
             "as with integers beyond 2**53"
         )
@@ -337,16 +306,6 @@ def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[T
     return state, drive, weights
 
 
-def _read_by(tracer: Tracer, interval: nn.Module, outputs: Iterable[int]) -> set[int]:
-    """The numbers of the inputs of an interval that outputs of a program depend on."""
-    p = tracer.program
-    firsts = {p.operations[k].attributes[0] for k in p.needed(outputs) if p.operations[k].name == "weights"}
-    sizes = [x.numel() for x in inputs_of(interval).values()]
-    return {
-        k for k, (end, size) in enumerate(zip(accumulate(sizes), sizes, strict=True)) if size and end - size in firsts
-    }
-
-
 # Kinds of intervals
 
 _holdings: "WeakKeyDictionary[nn.Module, tuple[Holdings, Inputs]]" = WeakKeyDictionary()
@@ -355,7 +314,6 @@ _codes: "OrderedDict[tuple[object, ...], tuple[IntervalCode | UntraceableError, 
 """The machine code of each kind of interval, or why there is none, with the objects that are known by address."""
 _modes: "WeakKeyDictionary[nn.Module, tuple[bool, ...]]" = WeakKeyDictionary()
 """The modes, training or evaluation, of the modules of an interval when it was found to be a function."""
-_tries = Counter[tuple[object, ...]]()
 _lock = threading.RLock()
 
 
@@ -387,9 +345,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
             if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
             point = point_of(initial_state, drive, max(ROWS, lanes_of_this_machine().number), sums)
-            code = _compiled(code, key, interval, point, holdings, driven if differentiated else None)
-            if code is None:
-                return None
+            code = _compiled(code, interval, point, holdings, driven if differentiated else None)
             _codes[key] = code, alive
             while len(_codes) > KEPT:
                 _codes.popitem(last=False)
@@ -398,14 +354,9 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
 
 
 def _compiled(
-    code: IntervalCode | None,
-    key: tuple[object, ...],
-    interval: nn.Module,
-    point: Point,
-    holdings: Holdings,
-    driven: bool | None,
-) -> IntervalCode | UntraceableError | None:
-    """The machine code with a sweep (None for none), or why there is none; None if the next call is to try again."""
+    code: IntervalCode | None, interval: nn.Module, point: Point, holdings: Holdings, driven: bool | None
+) -> IntervalCode | UntraceableError:
+    """The machine code with a sweep (None for none), or why there is none."""
     try:
         if code is None:
             require_pure(interval, *point)
@@ -417,9 +368,6 @@ def _compiled(
     except ImpureError:
         raise
     except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
-        _tries[key] += 1
-        if isinstance(error, UncomparedError) and _tries[key] < TRIES:
-            return None
         kind = "" if isinstance(error, UntraceableError) else f"{type(error).__name__}: "
         text = kind + str(error).rstrip(".")
         warnings.warn(f"engine 'autograd' takes the place of 'native': {text}.", stacklevel=2)

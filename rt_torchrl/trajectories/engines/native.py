@@ -24,7 +24,6 @@ from rt_torchrl.trajectories.engines.code import (
     IntervalCode,
     code_of,
     for_each_group,
-    require_pure_once,
     signals_of,
 )
 from rt_torchrl.trajectories.engines.interval import Autograd, CostInterval, Drive, GradientEngine
@@ -42,7 +41,6 @@ class Native(GradientEngine):
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         if initial_state.device.type != "cpu":
-            require_pure_once(interval, initial_state, drive)
             return Parallel().end_states(interval, initial_state, drive)
         ends = self.native_end_states(interval, initial_state, drive)
         return Autograd().end_states(interval, initial_state, drive) if ends is None else ends
@@ -79,7 +77,7 @@ class _Task:
 
     def __init__(self, code: IntervalCode, inputs: Inputs, initial_state: Tensor, drive: Drive):
         self.code, self.inputs, self.lanes = code, inputs, code.lanes.number
-        self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row(code.read_inputs)
+        self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row()
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
         self._signals = signals_of(self.drive)
