@@ -1,13 +1,12 @@
 """Calls that find what is wrong with a plant, or with a classical controller, before a training does."""
 
 import copy
-import inspect
+import traceback
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch import nn
-
-from rt_torchrl.contract.draws import draws, misshapen, modules, numbers_of, seeded, signals
+from rt_torchrl.contract.draws import draws, misshapen, modules, seeded, signals
 from rt_torchrl.contract.gradients_and_tracing import (
     first_line,
     gradients,
@@ -24,15 +23,12 @@ Check = Callable[[Calls], Iterable[str]]
 STATES = 3
 """Number of states that a classical controller is tried in."""
 ALWAYS = ("signals", "draws", "closures and policy")
-EPISODES = (
-    "It must take any number of episodes and of control intervals: read both from the shapes of its arguments, not "
-    "from n_steps."
+REMEDY = (
+    "It must work for every leading dimension and any number of control intervals, read from the shapes of its "
+    "arguments and not from n_steps, and under vmap and jacrev of torch.func; call .eval() on layers that normalise a "
+    "batch."
 )
-ANYWHERE = (
-    "It must work for every leading dimension, under vmap and jacrev of torch.func; call .eval() on layers that "
-    "normalise a batch."
-)
-REMEDIES = dict.fromkeys(("merit", "setpoints"), EPISODES)
+LIBRARY = str(Path(__file__).parent.parent)
 
 
 class ContractReport(NamedTuple):
@@ -110,7 +106,9 @@ def check_plant(
             raise ValueError(f"{argument}={value} of the check must be at least 2.")
     if isinstance(plant, type):
         raise ValueError(f"plant={plant.__name__} is a class; give a plant, such as {plant.__name__}().")
-    plant, steps = _on_cpu(plant), min(steps, plant.n_steps)
+    if any(tensor.device.type != "cpu" for tensor in (*plant.parameters(), *plant.buffers())):
+        plant = copy.deepcopy(plant).cpu()
+    steps = min(steps, plant.n_steps)
     violations = [*signals(plant)] or [*attempt(draws, plant, seed), *attempt(modules, plant, seed)]
     violations = violations or _on_flights(plant, episodes, steps, seed, trained=trained)
     if violations:
@@ -118,12 +116,6 @@ def check_plant(
     calls = Calls.at_the_start(plant, episodes, seed)
     reason = untraceable(calls) if traced else None
     return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, step_error(calls), reason)
-
-
-def _on_cpu(plant: Plant) -> Plant:
-    """The plant, or a copy of one that has tensors on another device."""
-    tensors = (*plant.parameters(), *plant.buffers()) if isinstance(plant, nn.Module) else ()
-    return plant if all(tensor.device.type == "cpu" for tensor in tensors) else copy.deepcopy(plant).cpu()
 
 
 def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, *, trained: bool) -> list[str]:
@@ -146,15 +138,12 @@ def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: 
     try:
         yield from check(subject, *rest)
     except Exception as error:
-        plant, trace = subject.plant if isinstance(subject, Calls) else subject, inspect.trace()
-        calls = [k for k, x in enumerate(trace) if x.frame.f_locals.get("self") is plant and hasattr(plant, x.function)]
-        method = name or trace[calls[-1] if calls else -1].function
-        inside = trace[calls[-1] if calls else 0 :]
-        frames = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
-        place = (frames or inside)[-1]
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [x for x in frames if not x.filename.startswith((LIBRARY, "<")) and "site-packages" not in x.filename]
+        first, *_, last = own * 2 or frames[-1:] * 2
         yield (
-            f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: {first_line(error)}. "
-            f"{REMEDIES.get(method, ANYWHERE)}"
+            f"{name or first.name}: raised {type(error).__name__} in {last.filename}, line {last.lineno}: "
+            f"{first_line(error)}. {REMEDY}"
         )
 
 
@@ -176,35 +165,29 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
         ValueError: if there is something wrong; the message says what, and what is expected.
     """
     if not (isinstance(law, type) and issubclass(law, ClassicalController)):
-        given = f"the class {law.__name__}" if isinstance(law, type) else f"an instance of {type(law).__name__}"
-        instead = f"its class, {type(law).__name__}" if isinstance(law, ClassicalController) else "a subclass of it"
-        raise ValueError(f"{name}, {given}, must be a class derived from ClassicalController; give {instead}.")
+        raise ValueError(f"{name}={law!r} must be a class derived from ClassicalController: give the class itself.")
     controller, state = law(plant), plant.draw_initial_state(STATES, seeded(0))[:, : len(plant.readings)]
-    size, about = controller.memory_size, f"{name}: {law.__name__}"
+    size, about, actions = controller.memory_size, f"{name}: {law.__name__}", len(plant.actions)
     memory, exogenous = controller.first_memory(state), plant.draw_exogenous(STATES, seeded(0))[:, 0]
-    _require(f"{about}.first_memory returns", memory, size, f"memory_size={size}")
+    _require(f"{about}.first_memory returns a memory", memory, size)
     try:
-        result = controller.law(state, memory, exogenous)
-    except (IndexError, RuntimeError, TypeError) as error:
+        command, memory = controller.law(state, memory, exogenous)
+    except (IndexError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{about}.law fails for states of shape {tuple(state.shape)}, a memory of shape {tuple(memory.shape)} and "
-            f"inputs of shape {tuple(exogenous.shape)}: {first_line(error)}. It is law(state, memory, exogenous), and "
-            f"its memory has as many columns as memory_size={size} says."
+            f"inputs of shape {tuple(exogenous.shape)}: {first_line(error)}. It is law(state, memory, exogenous), its "
+            f"memory has as many columns as memory_size={size} says, and it returns both, command and memory."
         ) from error
-    if not (isinstance(result, tuple) and len(result) == 2):
-        raise ValueError(f"{about}.law returns {type(result).__name__}; give both: return command, memory.")
-    actions = ", ".join(signal.name for signal in plant.actions)
-    _require(f"{about}.law returns a command,", result[0], len(plant.actions), f"actions {actions}")
-    _require(f"{about}.law returns a memory,", result[1], size, f"memory_size={size}")
+    _require(f"{about}.law returns a command", command, actions)
+    _require(f"{about}.law returns a memory", memory, size)
 
 
-def _require(about: str, value: object, columns: int, why: str) -> None:
+def _require(about: str, value: object, columns: int) -> None:
     """Refuse what is no finite tensor of a batch with so many columns in double precision."""
-    shape = (STATES, columns)
-    if problem := misshapen(value, shape):
+    if problem := misshapen(value, (STATES, columns)):
         raise ValueError(
-            f"{about} {problem} for {STATES} states; expected {numbers_of(shape)} ({why}). A column is state[:, :1], "
-            "not state[:, 0]."
+            f"{about} of {problem}: a row for each of {STATES} states, and a column, which is state[:, :1] and not "
+            "state[:, 0], for each action or number of the memory (memory_size)."
         )
 
 

@@ -64,27 +64,25 @@ def draws(plant: Plant, seed: int) -> Iterator[str]:
         draw = partial(getattr(plant, name), BATCH)
         drawn = draw(seeded(seed))
         if problem := misshapen(drawn, shape):
-            yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}; expected {numbers_of(shape)}."
+            yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}."
         else:
             yield from _out_of_range(name, drawn, group)
             yield from _other_sources(name, draw, seed)
 
 
 def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
-    """The fault of a value that should be a finite float64 tensor of the shape; None if there is no fault."""
+    """What a value is that should be a finite float64 tensor of the shape, and what it should; None if it is one."""
     if not isinstance(value, Tensor):
-        return f"a {type(value).__name__}"
-    if tuple(value.shape) != shape:
-        return f"shape {tuple(value.shape)}"
-    if value.dtype != torch.float64:
-        return f"{value.dtype}"
-    count = int((~value.isfinite()).sum())
-    return f"{count} values that are not finite" if count else None
-
-
-def numbers_of(shape: tuple[int, ...]) -> str:
-    """The expected value, in words for a message."""
-    return f"finite numbers of shape {shape} in torch.float64"
+        found = f"a {type(value).__name__}"
+    elif tuple(value.shape) != shape:
+        found = f"shape {tuple(value.shape)}"
+    elif value.dtype != torch.float64:
+        found = f"{value.dtype}"
+    elif not value.isfinite().all():
+        found = f"{int((~value.isfinite()).sum())} values that are not finite"
+    else:
+        return None
+    return f"{found}, expected finite numbers of shape {shape} in torch.float64"
 
 
 def _out_of_range(name: str, drawn: Tensor, group: tuple[Signal, ...]) -> Iterator[str]:
@@ -135,7 +133,7 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
     observations = 3.0 * torch.rand(50, len(plant.observations), generator=seeded(seed), dtype=torch.float64) - 1.5
     command = plant.make_policy(seeded(seed))(observations)
     if problem := misshapen(command, shape):
-        yield f"make_policy: its commands on 50 observations have {problem}; expected {numbers_of(shape)}."
+        yield f"make_policy: its commands on 50 observations have {problem}."
     else:
         yield from _out_of_range("make_policy", command.detach(), plant.actions)
 

@@ -1,6 +1,7 @@
 """Checks of what engines and compilers need: stable steps, exact derivatives of any batch, and traceable methods."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,7 @@ from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.trajectories.engines.code import IntervalCode, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval, costate_products
-from rt_torchrl.trajectories.engines.parallel import as_one_batch
+from rt_torchrl.trajectories.engines.parallel import jacobians_by_rows, over_all
 from rt_torchrl.trajectories.twin import jacobians_of
 
 STEP = 1e-6
@@ -129,8 +130,9 @@ def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: s
     for k, signal in enumerate(getattr(calls.plant, SIGNALS[argument])):
         direction = torch.zeros_like(value)
         direction[..., k] = 1e-3 + value.detach()[..., k].abs().max()
-        sides, slope = _along(value, direction, measure), (gradient * direction).sum(-1)
-        yield from _verdict(method.name, f"{argument} {signal.name!r}", slope, _differences(sides, slope))
+        slope = (gradient * direction).sum(-1)
+        differences = _differences(value, direction, measure, slope)
+        yield from _verdict(method.name, f"{argument} {signal.name!r}", slope, differences)
 
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
@@ -140,8 +142,8 @@ def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.M
     for (name, weight), gradient in zip(weights.items(), _gradients(measure, [*weights.values()]), strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
         direction *= 1e-3 + weight.detach().abs().max()
-        sides, slope = _along(weight, direction, measure).flatten(1).sum(-1), (gradient * direction).sum()
-        differences = _differences(sides, slope)
+        slope = (gradient * direction).sum()
+        differences = _differences(weight, direction, lambda: measure().sum(), slope)
         violations = [*_verdict(method.name, f"{whose} weight {name!r}", slope, differences)]
         yield from violations
         matters = gradient.any() or differences.any() or id(weight) in dormant
@@ -160,24 +162,21 @@ def _dormant(closure: nn.Module) -> set[int]:
 
 
 @torch.no_grad()
-def _along(x: Tensor, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
-    """The differences forwards and backwards along a direction of a tensor, which then has its value again, to the bit.
+def _differences(x: Tensor, direction: Tensor, measure: Callable[[], Tensor], slope: Tensor) -> Tensor:
+    """The central difference along a direction of a tensor, which then has its value again, to the bit.
 
-    They differ where a law has a corner, such as that of a rate limit.
+    In a corner, such as that of a rate limit, it is what lies nearest to the slope between the differences of both
+    sides.
     """
     value, ends = x.clone(), []
     for sign in (1.0, 0.0, -1.0):
         x.copy_(value + sign * STEP * direction)
         ends.append(measure())
     x.copy_(value)
-    return torch.stack([ends[0] - ends[1], ends[1] - ends[2]]) / STEP
-
-
-def _differences(sides: Tensor, slope: Tensor) -> Tensor:
-    """The central difference or, in a corner, what lies nearest to a slope between the differences of both sides."""
+    sides = torch.stack([ends[0] - ends[1], ends[1] - ends[2]]) / STEP
     low, high = sides.amin(0), sides.amax(0)
     corner = ((high - low) > CORNER * (1.0 + slope.abs())) & ((high - low) * STEP < JUMP)
-    return torch.where(corner, torch.minimum(torch.maximum(slope, low), high), sides.mean(0))
+    return torch.where(corner, slope.clamp(low, high), sides.mean(0))
 
 
 def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[], Tensor]:
@@ -206,30 +205,16 @@ def _gradients(measure: Callable[[], Tensor], inputs: list[Tensor]) -> Sequence[
 def _verdict(method: str, by: str, slope: Tensor, differences: Tensor) -> Iterator[str]:
     """A violation if a slope by autograd is not that by finite differences."""
     bad = ~((slope - differences).abs() <= ABSOLUTE + RELATIVE * differences.abs())
-
-    def largest(values: Tensor) -> str:
-        picked = values[bad]
-        return f"{picked[picked.abs().argmax()].item():.6g}"
-
     if not bad.any():
         return
-    if not slope.isfinite().all():
-        yield (
-            f"{method}: its derivative by {by} is not finite; expected a finite slope everywhere: mind sqrt, norm and "
-            "pow at zero, and torch.where, whose unused branch still passes its slope on."
-        )
-    elif not slope[bad].any():
-        yield (
-            f"{method}: autograd finds no dependence on {by}, finite differences do ({largest(differences)}); the path "
-            "is cut: use torch operations on the tensors themselves, without detach, item, float, numpy, torch.tensor "
-            "or no_grad."
-        )
-    else:
-        yield (
-            f"{method}: its derivative by {by} is {largest(slope)}, by finite differences {largest(differences)} (in "
-            f"units of the signals' sizes, in {int(bad.sum())} of {bad.numel()} places); a part of the path is cut "
-            "(detach, item, numpy), or it jumps: use smooth laws, or torch.where between laws that meet."
-        )
+    k = differences[bad].abs().argmax()
+    found = f"{method}: its derivative by {by} is {slope[bad][k]:.6g}, by finite differences {differences[bad][k]:.6g}"
+    yield (
+        f"{found} (in units of the signals' sizes, in {int(bad.sum())} of {bad.numel()} places). Zero, or a part: the "
+        "path is cut; use torch operations on the tensors themselves, without detach, item, float, numpy, torch.tensor "
+        "or no_grad. Not finite: mind sqrt, norm and pow at zero, and torch.where, whose unused branch still passes "
+        "its slope on. Or it jumps: use smooth laws, or torch.where between laws that meet."
+    )
 
 
 def jacobians(calls: Calls) -> Iterator[str]:
@@ -240,10 +225,9 @@ def jacobians(calls: Calls) -> Iterator[str]:
     """
     arguments = calls.some(3)
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
-    interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
-    vectorised = jacobians_of(interval, (), *as_one_batch(state.detach(), drive)).unflatten(0, state.shape[:2])
-    rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
-    reverse = torch.stack(rows, -2)
+    interval, state = Interval(calls.plant, calls.closure, None), arguments["state"]
+    reverse = jacobians_by_rows(interval, state, drive)
+    vectorised = over_all(partial(jacobians_of, interval, ()), state, drive)
     gap = ((vectorised - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
     if gap > 1e-6:
         yield (

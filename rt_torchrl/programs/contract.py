@@ -470,9 +470,9 @@ def _where(code: types.CodeType) -> str:
 GAP = 1e-8
 """Greatest difference of two answers, relative to the largest of a signal: sums may be taken in another order."""
 PURE = (
-    "Policy, closure and plant must be pure functions: call .eval() on a module with dropout or batch normalisation; "
-    "what is to be remembered must be a state of the plant, or part of the observation; random numbers belong in "
-    "draw_exogenous"
+    "Policy, closure and plant must be pure functions that change none of their arguments: call .eval() on a module "
+    "with dropout or batch normalisation; what is to be remembered must be a state of the plant, or part of the "
+    "observation; random numbers belong in draw_exogenous"
 )
 
 
@@ -504,12 +504,12 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
             alone = module(*tree_map(operator.itemgetter(row), arguments)).detach()
         except Exception as error:
             raise ImpureError(
-                f"an interval of one realisation alone raises {type(error).__name__}: {str(error).rstrip('.')}; one of "
-                f"{len(first)} realisations does not. Policy, closure and plant must take any number of rows."
+                f"one realisation alone raises {type(error).__name__}: {str(error).rstrip('.')}; {len(first)} at once "
+                "do not. Policy, closure and plant must take any number of rows."
             ) from error
         if not _equal([alone], [first[row]]):
             raise ImpureError(
-                "the end of an interval depends on the other realisations that are computed with it: it is "
+                "the result for a realisation depends on the other realisations that are computed with it: it is "
                 f"{alone[0].tolist()} alone and {first[row][0].tolist()} beside others. Rows are systems of their own: "
                 "no sum, mean, norm or branch over a leading dimension in policy, closure or plant."
             )

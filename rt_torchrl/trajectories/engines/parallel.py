@@ -60,7 +60,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = _jacobians(ctx.interval, starts, drive)
+        jacobians = jacobians_by_rows(ctx.interval, starts, drive)
         after = costates(jacobians[1:], cost_gradient)  # λ_1 ... λ_n
         gradients = _products(ctx.interval, starts, drive, weights, after)
         return None, torch.einsum("bji,bj->bi", jacobians[0], after[0]), *gradients
@@ -102,20 +102,12 @@ def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
 # All intervals at once
 
 
-def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
-    """The intervals of all realisations as ``n·batch`` rows.
-
-    A function of single intervals does not depend on the trajectories that these belong to.
-    """
-    t = drive.t.expand(starts.shape[:2]).flatten()
-    return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
-
-
 def _pieces(each: int, starts: Tensor, drive: Drive, *others: Tensor) -> Iterator[tuple[Tensor, ...]]:
     """States, drive and other rows of all intervals of all realisations in pieces; a row counts ``each`` times."""
-    rows, driven = as_one_batch(starts, drive)
-    size = max(1, (PIECE if rows.device.type == "cpu" else LARGE_PIECE) // each)
-    yield from zip(*(x.split(size) for x in (rows, *driven, *others)), strict=True)
+    t = drive.t.expand(starts.shape[:2])
+    rows = [x.flatten(0, 1) for x in (starts, t, drive.exogenous, drive.command)]
+    size = max(1, (PIECE if starts.device.type == "cpu" else LARGE_PIECE) // each)
+    yield from zip(*(x.split(size) for x in (*rows, *others)), strict=True)
 
 
 def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
@@ -130,7 +122,7 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
     return torch.cat(values).unflatten(0, starts.shape[:2])
 
 
-def _jacobians(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
+def jacobians_by_rows(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
     """∂Φ/∂s at every interval, ``n batch n_s n_s``; an interval is computed once for each row of its Jacobian."""
     n_s, jacobians = starts.shape[-1], list[Tensor]()
     basis = torch.eye(n_s, dtype=starts.dtype, device=starts.device)
