@@ -45,7 +45,7 @@ from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
-from rt_torchrl.steps.interact import Interact, RealFlights, Supervisor
+from rt_torchrl.steps.interact import Interact, Operate, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, merged, metrics, on_device
@@ -103,6 +103,7 @@ class ReinforcementTwinning(TensorDictSequential):
     planner: Planner
     referee: Referee
     first: Start | None
+    operating: Operate | None
 
     def __init__(
         self,
@@ -143,8 +144,10 @@ class ReinforcementTwinning(TensorDictSequential):
         rollout = collector.rollout if isinstance(collector, Operation) else lambda: next(iter(collector))
         flights = RealFlights(env, actor, rollout, twin.plant)
         trained = {role: policy for role, policy in policies.items() if config.arm in ("twinning", role)}
-        supervisor = Supervisor(system, trained, belief, config.limits, None if first is None else first.teacher)
-        interact = Interact(env, policies, flights, supervisor, belief, config, judged)
+        teacher = None if first is None else first.teacher
+        supervisor = Supervisor(system, trained, belief, config.limits, judged, teacher)
+        operating = isinstance(env, Operation)
+        interact = (Operate if operating else Interact)(flights, supervisor, belief, config)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
             assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
@@ -162,10 +165,11 @@ class ReinforcementTwinning(TensorDictSequential):
         self.closure, self.model_free, self.model_based = twin.closure, model_free, model_based
         self.twin, self.config, self.generator, self.policies = twin, config, generator, policies
         self.virtual, self.belief, self.assimilation, self.flights = virtual, belief, assimilation, flights
-        self.short_term, self.operating, self.steps = interact.short_term, interact.operating, steps
+        self.short_term, self.steps = interact.short_term, steps
         self.episodes_done = 0
         # These may be modules, but no sub-modules: what lasts of them belongs to the steps.
         parts = {"env": env, "actor": actor, "collector": collector, "first": first}
+        parts["operating"] = interact if operating else None
         self.__dict__.update(parts, learner=learner, planner=planner, referee=referee)
 
     def insert(self, name: str, step: TensorDictModuleBase, *, before: str) -> None:
@@ -199,7 +203,7 @@ class ReinforcementTwinning(TensorDictSequential):
         """
         flown = self(TensorDict({"number": self.episodes_done}), tell=tell)
         self.episodes_done += 1
-        if self.operating:
+        if self.operating is not None:
             self.operating.hand_over(self.referee.live, self.episodes_done)
         # Numbers, texts and seconds are the report; all else is data that flows between the steps.
         keys = [key for key in flown.keys() if key != "seconds" and not isinstance(flown[key], str)]  # noqa: SIM118
@@ -232,7 +236,7 @@ class ReinforcementTwinning(TensorDictSequential):
             half.restart()
         if not pupils:
             return episode
-        flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
+        flights = self.first.flights(self.steps["interact"].fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         counted = len(records[-1].actions) + flights[-1].after[0]
         for flight in flights:

@@ -366,8 +366,8 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
     assert len(found.belief.first[0].trajectory.actions) < plant.n_steps
     assert found.virtual.draw(2).exogenous.shape[1] == plant.n_steps
     assert imitated and not any(plant.ended(observations).any() for observations in imitated)
-    choice = found.steps["interact"].supervisor.choose("model_based", 5)
-    assert choice.role == "first" and "would leave the limits" in choice.report["reason"]
+    _, role, report = found.steps["interact"].supervisor.choose("model_based")
+    assert role == "first" and "would leave the limits" in report["reason"]
     (record,) = found.short_term  # the twin is fitted to it with those to come
     with torch.no_grad():
         found.twin.closure.matrix.copy_(torch.tensor(plant.true_closure) + torch.tensor([[0.0, 0.0], [-0.02, 0.0]]))

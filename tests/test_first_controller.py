@@ -93,8 +93,8 @@ def test_the_controller_flies_while_policies_are_expected_to_cost_twice_as_much(
     assert found.episode()["live"] == "model_based"
     state = found.state_dict()
     wild(found)
-    again = found.steps["interact"].supervisor.choose("model_based", 3)
-    assert again.role == "first" and again.policy is found.first.teacher
+    policy, role, _ = found.steps["interact"].supervisor.choose("model_based")
+    assert role == "first" and policy is found.first.teacher
     other = begun()
     other.load_state_dict(state)
     assert [one.cost for one in other.belief.first] == paid

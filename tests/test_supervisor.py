@@ -63,9 +63,8 @@ def test_a_policy_that_would_leave_them_does_not_act():
     found.policies[found.referee.live].load_state_dict(wild)
     live = found.referee.live
     idle = other_than(live)
-    choice = found.steps["interact"].supervisor.choose(live, 5)
-    assert choice.role == idle and f"{live} may not act" in choice.report["reason"]
-    assert choice.report["predicted_violations"] == 0.0
+    _, role, report = found.steps["interact"].supervisor.choose(live)
+    assert role == idle and f"{live} may not act" in report["reason"] and report["predicted_violations"] == 0.0
     # The oracle: the same share by a flight of the twin.
     episodes = found.virtual.draw(5)
     share = found.steps["interact"].supervisor.predicted(found.policies[live], episodes)
@@ -75,11 +74,11 @@ def test_a_policy_that_would_leave_them_does_not_act():
     assert share == pytest.approx((beyond | jumps).double().mean().item()) and share > 0.2
     # Neither: the weights that were cleared last act, under their role.
     found.policies[idle].load_state_dict(wild)
-    last = found.steps["interact"].supervisor.choose(live, 5)
-    assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
-    assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
+    last, role, report = found.steps["interact"].supervisor.choose(live)
+    assert role == idle and last is not found.policies[idle] and "reason" in report
+    assert torch.equal(last.gain, torch.full_like(last.gain, 0.05))
     assert after(found)["live"] == idle
-    assert torch.equal(found.belief.policy_of(found.belief.flown[-1]).gain, last.policy.gain)
+    assert torch.equal(found.belief.policy_of(found.belief.flown[-1]).gain, last.gain)
 
 
 def test_without_a_policy_that_may_act_the_training_says_so():

@@ -143,7 +143,7 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
     policy = algorithm.policies[live]
     if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
         return f"{live} has its random initial weights"
-    return interact.supervisor.refusal(live, interact.supervisor.episodes(interact.judged))[0]
+    return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
 
 
 def announcement(names: Iterable[str], live: Role, count: int) -> str:

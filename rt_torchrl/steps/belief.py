@@ -129,7 +129,7 @@ class Belief:
 
     def __init__(self, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, *, corrects: bool = True):
         self.virtual, self.corrects = virtual, corrects
-        self._policies = policies
+        self.policies = policies
         self.flown: list[Flown] = []
         self.first: list[FirstFlown] = []
         """The latest episodes of the controller that flew first."""
@@ -162,7 +162,7 @@ class Belief:
             ValueError: if the cost is negative, because differences are logs of the ratio of two costs.
         """
         self._require_ratio(cost)
-        weights = self._policies[role].state_dict() if weights is None else weights
+        weights = self.policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         flown = Flown(trajectory, role, weights, cost)
         if commands is not None:
@@ -232,7 +232,7 @@ class Belief:
         There is one copy for each role, because the twin keeps the code of few modules.
         """
         if flown.role not in self._copies:
-            self._copies[flown.role] = copy.deepcopy(self._policies[flown.role])
+            self._copies[flown.role] = copy.deepcopy(self.policies[flown.role])
         policy = self._copies[flown.role]
         policy.load_state_dict(flown.weights)
         return policy
@@ -253,7 +253,7 @@ class Belief:
         if self._costs is None or not equal(state, self._costs[0]):
             costs = list[float]()
             for flown in self.flown:
-                if isinstance(self._policies[flown.role], StateFeedback):
+                if isinstance(self.policies[flown.role], StateFeedback):
                     costs.append(math.nan)
                 else:
                     episode = virtual.repeated(flown.trajectory)

@@ -16,7 +16,7 @@ from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.report import Step, in_words, merged, metrics, plain
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation import FIRST, Operation, Order
+from rt_torchrl.systems.operation import FIRST, Operation
 from rt_torchrl.systems.safety import OperatingLimits, require_layer
 from rt_torchrl.systems.sound_part import (
     FLIGHTS,
@@ -59,7 +59,6 @@ class Flight(NamedTuple):
         record: the trajectory of that part; its clock says where it begins.
         parts: the transitions of all sound parts, in their order.
         refused: why earlier attempts could not be learned from.
-        faults: faults of the system in this episode and in the earlier attempts.
         whole: whether the record is that of a whole episode, to its horizon or to its early end.
         after: number of control intervals after an early end, and what each of them costs, L_e.
         commands: the commands of the record's intervals, before safety layers and actuators.
@@ -69,56 +68,15 @@ class Flight(NamedTuple):
     record: Trajectory
     parts: Sequence[TensorDict]
     refused: Sequence[str] = ()
-    faults: Sequence[Fault] = ()
     whole: bool = True
     after: tuple[int, float] = (0, 0.0)
     commands: Tensor | None = None
-
-    @property
-    def ended(self) -> bool:
-        """Whether the episode has ended early, before the last interval of the horizon."""
-        return bool(self.after[0])
 
     @property
     def cost(self) -> Tensor:
         """J_a as measured, in the sound part and after an early end."""
         rewards, (count, end_cost) = self.transitions["next", "reward"], self.after
         return -(rewards.sum() - count * end_cost) / (len(rewards) + count)
-
-
-def report_of_flights(flights: Sequence[Flight]) -> TensorDict:
-    """The cost of the last of some flights, the faults of all, and how often and why they were flown again."""
-    last = flights[-1]
-    report = metrics(real_cost=last.cost, reward=-last.cost)
-    refused = [reason for flight in flights for reason in flight.refused]
-    if refused:
-        report.update(metrics(episodes_refused=float(len(refused)), refusal="; ".join(refused)))
-    kinds = Counter(fault.kind for flight in flights for fault in flight.faults)
-    report.update(metrics(**{f"faults/{kind}": float(count) for kind, count in kinds.items()}))
-    if last.ended:
-        report.update(metrics(ended_after=float(len(last.transitions))))
-    if not all(flight.whole for flight in flights):
-        report.update(metrics(sound_intervals=float(sum(len(part) for flight in flights for part in flight.parts))))
-    return report
-
-
-def flown(flights: Sequence[Flight]) -> TensorDict:
-    """The record of the last of some flights, and the transitions of all their sound parts."""
-    last = flights[-1]
-    record = last.record
-    parts = [part for flight in flights for part in flight.parts]
-    return TensorDict(
-        {
-            "record": {
-                "states": record.states,
-                "actions": record.actions,
-                "exogenous": record.exogenous,
-                "start": torch.as_tensor(record.start, dtype=torch.float64, device=record.states.device),
-                "whole": torch.tensor(last.whole, device=record.states.device),
-            },
-            "transitions": {str(number): part for number, part in enumerate(parts)},
-        }
-    )
 
 
 class RealFlights:
@@ -131,13 +89,7 @@ class RealFlights:
         plant: plant that gives the length of an episode.
     """
 
-    def __init__(
-        self,
-        env: EnvBase | Operation,
-        actor: LivePolicy,
-        rollout: Callable[[], TensorDict],
-        plant: Plant,
-    ):
+    def __init__(self, env: EnvBase | Operation, actor: LivePolicy, rollout: Callable[[], TensorDict], plant: Plant):
         self.env, self.actor, self.rollout, self.plant = env, actor, rollout, plant
         self._least = max(SHORTEST, LEAST_SOUND * plant.n_steps)
         self.faults: list[Fault] = []
@@ -157,56 +109,43 @@ class RealFlights:
             ValueError: if several episodes in a row cannot be learned from.
         """
         refused: list[str] = []
-        faults: list[Fault] = []
         while True:
             self.actor.begin(policy, strength=strength)
-            episode, sound, cause = self._attempt()
-            faults += sound.faults
+            episode, sound, failure = self._attempt()
             self.faults += sound.faults
             first, last = sound.longest
             if episode is not None and (sound.whole or (not whole and last - first >= self._least)):
                 break
             refused.append(sound.reason)
             if len(refused) == FLIGHTS:
-                raise ValueError(tried_in_vain(refused)) from cause
-        commands = episode["action"][first:last].clone()
+                raise ValueError(tried_in_vain(refused)) from failure
+        rows = episode[first:last]
+        commands, states = rows["action"].clone(), torch.cat([rows["state"], rows["next", "state"][-1:]])
         parts = [_transitions(episode, part) for part in sound.parts]
-        transitions, record = parts[sound.parts.index((first, last))], self._record(episode, (first, last))
+        transitions = parts[sound.parts.index((first, last))]
+        record = Trajectory(states, rows["next", "applied"], rows["exogenous"], first * self.plant.dt)
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
         if self.check is not None:
             check, self.check = self.check, None
             check(record)
-        return Flight(transitions, record, parts, refused, faults, sound.whole, after, commands)
-
-    def _record(self, episode: TensorDictBase, part: tuple[int, int]) -> Trajectory:
-        """The trajectory of a part of an episode, with the actions that were applied."""
-        first, last = part
-        flown = episode[first:last]
-        states = torch.cat([flown["state"], flown["next", "state"][-1:]])
-        return Trajectory(states, flown["next", "applied"], flown["exogenous"], first * self.plant.dt)
-
-    def fly_first(self, policy: nn.Module) -> Flight:
-        """Fly one whole episode without exploration."""
-        return self.fly(policy, strength=0.0, whole=True)
+        return Flight(transitions, record, parts, refused, sound.whole, after, commands)
 
     def _attempt(self) -> tuple[TensorDictBase | None, SoundPart, Exception | None]:
         """One episode, its sound part, and the error that ended it."""
         try:
-            episode, failure = self.rollout()[0], None
+            flown, failure = self.rollout(), None
         except EpisodeEndedError as error:
-            failure, flown = error, error.flown
-            if flown is None:
-                fault = Fault("ended", 0, 0.0, str(error))
-                return None, SoundPart([], [fault], str(error), whole=False), error
-            episode = flown[0]
-        report = self.env.report if isinstance(self.env, Operation) else report_of(self.env)
-        sound = sound_part(episode, self.plant, report)
-        if failure is None:
-            return episode, sound, None
-        n = len(episode)
-        fault = Fault("ended", n, n * self.plant.dt, str(failure))
-        reason = "; ".join(part for part in (sound.reason, str(failure)) if part)
-        return episode, sound._replace(faults=[*sound.faults, fault], reason=reason, whole=False), failure
+            flown, failure = error.flown, error
+        sound, episode = SoundPart([], [], "", whole=False), None if flown is None else flown[0]
+        if episode is not None:
+            report = self.env.report if isinstance(self.env, Operation) else report_of(self.env)
+            sound = sound_part(episode, self.plant, report)
+        if failure is not None:
+            n = 0 if episode is None else len(episode)
+            faults = [*sound.faults, Fault("ended", n, n * self.plant.dt, str(failure))]
+            reason = "; ".join(part for part in (sound.reason, str(failure)) if part)
+            sound = sound._replace(faults=faults, reason=reason, whole=False)
+        return episode, sound, failure
 
 
 def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
@@ -218,14 +157,6 @@ def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
     transitions["next", "done"][-1] = True
     transitions["next", "truncated"][-1] = ~transitions["next", "terminated"][-1]
     return transitions
-
-
-class Choice(NamedTuple):
-    """What may act, the role whose weights it has or ``first``, and the report of the check."""
-
-    policy: nn.Module
-    role: str
-    report: TensorDict
 
 
 class Supervisor:
@@ -240,6 +171,7 @@ class Supervisor:
         policies: the policies that are trained, by role.
         belief: what policies cost, and the virtual episodes.
         config: the limits.
+        count: number of virtual episodes of a check.
         controller: what the training has begun with; None without.
 
     Raises:
@@ -252,57 +184,56 @@ class Supervisor:
         policies: Mapping[Role, nn.Module],
         belief: Belief,
         config: OperatingLimitsConfig,
+        count: int,
         controller: nn.Module | None = None,
     ):
-        self.limited = bool(config)
-        if self.limited:
+        if config:
             require_layer(env)
-        self.policies, self.belief, self.virtual = policies, belief, belief.virtual
-        self.limits, self.controller = OperatingLimits(belief.virtual.twin.plant, config), controller
+        self.limits = OperatingLimits(belief.virtual.twin.plant, config) if config else None
+        self.policies, self.belief, self.count, self.controller = policies, belief, count, controller
         self._last: dict[str, Any] | None = None
         """The role and weights that were cleared last."""
 
     @torch.no_grad()
-    def choose(self, live: Role, count: int) -> Choice:
+    def choose(self, live: Role) -> tuple[nn.Module, str, TensorDict]:
         """What may act.
 
         Args:
             live: role that the referee wants to act.
-            count: number of virtual episodes of the check.
 
         Returns:
-            What may act. The report holds a reason for each policy that is refused and, of a policy with limits,
-            ``predicted_violations``, the share of control intervals beyond one.
+            What may act, the role whose weights it has or ``first``, and a report with a reason for each policy that is
+            refused and, of a policy with limits, ``predicted_violations``, the share of control intervals beyond one.
 
         Raises:
             ValueError: if nothing may act.
         """
-        episodes, refused = self.episodes(count), list[str]()
+        episodes, refused = self.episodes(), list[str]()
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
             if reason:
                 refused.append(reason)
             elif episodes is None:
-                return Choice(policy, role, metrics(*refused))
+                return policy, role, metrics(*refused)
             else:
                 self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
-                return Choice(policy, role, metrics(*refused, predicted_violations=share))
+                return policy, role, metrics(*refused, predicted_violations=share)
         if self._last is not None and episodes is not None:
             role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
             policy.load_state_dict(self._last["weights"])
-            share = self.predicted(policy, episodes)
-            return Choice(policy, role, metrics(*refused, predicted_violations=share))
+            return policy, role, metrics(*refused, predicted_violations=self.predicted(policy, episodes))
         if self.controller is not None:
-            return Choice(self.controller, FIRST, metrics(*refused))
+            return self.controller, FIRST, metrics(*refused)
         raise ValueError(
             f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, such "
             "as --start controller."
         )
 
-    def episodes(self, count: int) -> Scenario | None:
+    def episodes(self) -> Scenario | None:
         """Virtual episodes in which the limits are checked; None without limits, and before anything is known."""
-        return self.virtual.draw(count) if self.limited and self.virtual.processes else None
+        virtual = self.belief.virtual
+        return virtual.draw(self.count) if self.limits is not None and virtual.processes else None
 
     @torch.no_grad()
     def refusal(self, role: Role, episodes: Scenario | None) -> tuple[str, float]:
@@ -325,17 +256,12 @@ class Supervisor:
 
     def predicted(self, policy: nn.Module, episodes: Scenario) -> float:
         """The share of control intervals of virtual episodes beyond any limit; 1 if the twin diverges."""
+        assert self.limits is not None
         try:
-            flown = self.virtual.twin.control(policy, *episodes)
+            broken = self.limits.broken(self.belief.virtual.twin.control(policy, *episodes))
         except DivergenceError:
             return 1.0
-        broken = self.limits.broken(flown)
         return torch.stack(list(broken.values())).any(0).double().mean().item()
-
-    def counted(self, flown: Trajectory) -> TensorDict:
-        """Numbers of control intervals of a real episode beyond each kind of limits."""
-        broken = self.limits.broken(flown)
-        return metrics(**{f"violations/{kind}": intervals.sum().double() for kind, intervals in broken.items()})
 
     def state_dict(self) -> dict[str, Any]:
         return {"last": self._last}
@@ -344,84 +270,8 @@ class Supervisor:
         self._last = state["last"]
 
 
-class Operating:
-    """Takes the windows of an operation, and hands policies over.
-
-    A window counts as flown by the version that acted in most of it, or the later of two. Windows that the system flew
-    under what the training begins with are learned from, and never compared with a policy's predictions.
-
-    Args:
-        operation: the real system in operation.
-        step: step 1, with what it shares with the other steps.
-    """
-
-    def __init__(self, operation: Operation, step: "Interact"):
-        self.operation, self.step, self._exploration = operation, step, step.config.exploration
-
-    def fly_first(self, teacher: nn.Module) -> Flight:
-        """One window under what the training begins with, which then acts on until the first policy takes over."""
-        self.operation.hand_over(FIRST, teacher, strength=0.0)
-        return self.step.flights.fly_first(teacher)
-
-    def hand_over(self, role: Role, episode: int) -> None:
-        """Hand over what acts now, which :class:`Supervisor` chooses.
-
-        Args:
-            role: role that is live.
-            episode: number of the learner's episode, from 0.
-        """
-        policy, name, report = self.step.supervisor.choose(role, self.step.judged)
-        strength = 0.0 if name == FIRST else self._exploration.strength(episode)
-        self.operation.hand_over(name, policy, strength=strength, report=plain(report))
-
-    def take(self, live: Role, episode: int) -> tuple[Sequence[Flight], TensorDict]:
-        """Take every window that has come in; wait until one is of a policy.
-
-        Args:
-            live: role that acts from the first episode on.
-            episode: number of the learner's episode, from 0; before the first one nothing was handed over.
-
-        Returns:
-            The windows, oldest first; ``real_cost``, the mean J_a of the ``windows``, and what was measured of the
-            control intervals.
-        """
-        if episode == 0:
-            self.hand_over(live, 0)
-        flights, policy_flew = list[Flight](), False
-        while not policy_flew or self.operation.waiting():
-            if flights and flights[-1].whole and self.step.config.arm != "model_free":
-                self.step.virtual.learn(flights[-1].record)  # step 3 fits the last one
-            flight = self.step.flights.fly(self.step.policies["model_free"], strength=0.0, whole=self.step.wanting)
-            flights.append(flight)
-            order = self._order_of(flight)
-            policy_flew |= order.version > 0 or order.name != FIRST
-            self.step.keep(flight, order.name, order.weights)
-        return flights, self._report(flights)
-
-    def _order_of(self, flight: Flight) -> Order:
-        versions = flight.transitions["version"].flatten()
-        numbers, counts = versions.unique(return_counts=True)
-        return self.operation.orders[int(numbers[counts == counts.max()].max())]
-
-    def _report(self, flights: list[Flight]) -> TensorDict:
-        order = self._order_of(flights[-1])
-        cost = torch.stack([flight.cost for flight in flights]).mean()
-        report = report_of_flights(flights).update(metrics(real_cost=cost, reward=-cost, exploration=order.strength))
-        report.update(metrics(windows=float(len(flights)), version=float(order.version)))
-        merged(report, metrics(**(order.report or {}))).update(metrics(**(self.operation.acted or {})))
-        if self.step.supervisor.limited:
-            counted = [self.step.supervisor.counted(flight.record) for flight in flights]
-            kinds = counted[0].keys()
-            report.update(metrics(**{kind: sum(float(violations[kind]) for violations in counted) for kind in kinds}))
-        late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
-        if late.any():
-            period = 1e3 * late
-            report.update(metrics(late_median=period.median(), late_p99=period.quantile(0.99), late_max=period.max()))
-        return report.set_non_tensor("live", order.name)
-
-
 class Interact(Step):
-    """Step 1: the live policy flies one episode on the real system, or acts in a window of one that operates on.
+    """Step 1: the live policy flies one episode on the real system.
 
     Reads ``number``, that of the episode from 0, and ``live``, the role that acts. Writes ``record``, the trajectory of
     the sound part (``states`` n+1 × n_s, ``actions`` n × n_a, ``exogenous`` n × n_z, ``start`` [s], and whether it is
@@ -429,57 +279,66 @@ class Interact(Step):
     TorchRL's collectors give them, and ``real_cost``, J_a as measured.
 
     Args:
-        env: the real system, or an operation of one.
-        policies: both policies by role.
         flights: real episodes of the system.
         supervisor: which policy may act.
         belief: what takes the costs of whole episodes, and has the virtual episodes.
         config: hyper-parameters.
-        judged: number of virtual episodes on which policies are judged.
     """
 
     in_keys = ["number", "live"]
     out_keys = ["record", "transitions", "real_cost", "live"]
 
-    def __init__(
-        self,
-        env: EnvBase | Operation,
-        policies: dict[Role, nn.Module],
-        flights: RealFlights,
-        supervisor: Supervisor,
-        belief: Belief,
-        config: TwinningConfig,
-        judged: int,
-    ):
+    def __init__(self, flights: RealFlights, supervisor: Supervisor, belief: Belief, config: TwinningConfig):
         short_term = ShortTermMemory(maxlen=config.records)
-        super().__init__(env=env, supervisor=supervisor, short_term=short_term)
-        self.short_term, self.policies, self.flights = short_term, policies, flights
-        self.supervisor, self.belief, self.virtual = supervisor, belief, belief.virtual
-        self.config, self.judged = config, judged
-        self.operating = Operating(env, self) if isinstance(env, Operation) else None
+        super().__init__(env=flights.env, supervisor=supervisor, short_term=short_term)
+        self.flights, self.supervisor, self.belief, self.short_term = flights, supervisor, belief, short_term
+        self.config = config
 
     @property
     def wanting(self) -> bool:
         """Whether a twin still needs the inputs of one whole real episode."""
-        return self.config.arm != "model_free" and not self.virtual.processes
+        return self.config.arm != "model_free" and not self.belief.virtual.processes
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        live, number = episode["live"], int(episode["number"])
-        flights, report = (self.operating or self).take(live, number)
-        return merged(episode.update(flown(flights)), report)
+        """Take the step."""
+        flights, report = self.take(episode["live"], int(episode["number"]))
+        record, device = flights[-1].record, flights[-1].record.states.device
+        parts = [part for flight in flights for part in flight.parts]
+        episode["record"] = {
+            "states": record.states,
+            "actions": record.actions,
+            "exogenous": record.exogenous,
+            "start": torch.as_tensor(record.start, dtype=torch.float64, device=device),
+            "whole": torch.tensor(flights[-1].whole, device=device),
+        }
+        episode["transitions"] = {str(number): part for number, part in enumerate(parts)}
+        return merged(episode, merged(self._report(flights), report))
+
+    def _report(self, flights: Sequence[Flight]) -> TensorDict:
+        """The mean cost of flights, their faults, and how often and why they were flown again."""
+        cost, last = torch.stack([flight.cost for flight in flights]).mean(), flights[-1]
+        entries: dict[str, Any] = {"real_cost": cost, "reward": -cost}
+        if refused := [reason for flight in flights for reason in flight.refused]:
+            entries |= {"episodes_refused": float(len(refused)), "refusal": "; ".join(refused)}
+        kinds = Counter(fault.kind for fault in self.flights.faults)
+        entries |= {f"faults/{kind}": float(count) for kind, count in kinds.items()}
+        if last.after[0]:
+            entries["ended_after"] = float(len(last.transitions))
+        if not all(flight.whole for flight in flights):
+            entries["sound_intervals"] = float(sum(len(part) for flight in flights for part in flight.parts))
+        if self.supervisor.limits is not None:
+            broken = [self.supervisor.limits.broken(flight.record) for flight in flights]
+            entries |= {f"violations/{kind}": float(sum(b[kind].sum() for b in broken)) for kind in broken[0]}
+        return metrics(**entries)
 
     def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
-        """One episode of the policy that may act, the live one if it is cleared."""
-        choice = self.supervisor.choose(live, self.judged)
-        acting, strength = choice.policy, 0.0 if choice.role == FIRST else self.config.exploration.strength(number)
-        flight = self.flights.fly(acting, strength=strength, whole=self.wanting)
-        self.keep(flight, choice.role, acting.state_dict())
-        report = merged(report_of_flights([flight]), metrics(exploration=self.flights.actor.strength))
-        report = merged(report, choice.report)
-        if self.supervisor.limited:
-            report.update(self.supervisor.counted(flight.record))
-        report.update(metrics(**acting.report()) if isinstance(acting, StateFeedback) else {})
-        return [flight], report.set_non_tensor("live", choice.role)
+        """One episode of the policy that may act, the live one if it is cleared; and a report of what acted."""
+        policy, role, report = self.supervisor.choose(live)
+        strength = 0.0 if role == FIRST else self.config.exploration.strength(number)
+        flight = self.flights.fly(policy, strength=strength, whole=self.wanting)
+        self.keep(flight, role, policy.state_dict())
+        acted = policy.report() if isinstance(policy, StateFeedback) else {}
+        return [flight], report.update(metrics(exploration=strength, live=role, **acted))
 
     def keep(self, flight: Flight, pilot: str, weights: Mapping[str, Tensor]) -> None:
         """Remember the record of a flight and, if it is one of a whole episode, what it cost."""
@@ -490,3 +349,71 @@ class Interact(Step):
             self.belief.append_first(flight.record, flight.cost.item())
         else:
             self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), weights, flight.commands)
+
+    def fly_first(self, policy: nn.Module) -> Flight:
+        """Fly one whole episode without exploration."""
+        return self.flights.fly(policy, strength=0.0, whole=True)
+
+
+class Operate(Interact):
+    """Step 1 on a real system that operates on: takes its windows, and hands policies over.
+
+    A window counts as flown by the version that acted in most of it, or the later of two. Windows that the system flew
+    under what the training begins with are learned from, and never compared with a policy's predictions.
+    """
+
+    @property
+    def operation(self) -> Operation:
+        """The real system in operation."""
+        return cast(Operation, self.flights.env)
+
+    def fly_first(self, policy: nn.Module) -> Flight:
+        """One window under what the training begins with, which then acts on until the first policy takes over."""
+        self.operation.hand_over(FIRST, policy, strength=0.0)
+        return super().fly_first(policy)
+
+    def hand_over(self, live: Role, episode: int) -> None:
+        """Hand over what acts now, which :class:`Supervisor` chooses.
+
+        Args:
+            live: role that is live.
+            episode: number of the learner's episode, from 0.
+        """
+        policy, name, report = self.supervisor.choose(live)
+        strength = 0.0 if name == FIRST else self.config.exploration.strength(episode)
+        self.operation.hand_over(name, policy, strength=strength, report=plain(report))
+
+    def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
+        """Take every window that has come in; wait until one is of a policy.
+
+        Args:
+            live: role that acts from the first episode on.
+            number: number of the learner's episode, from 0; before the first one nothing was handed over.
+
+        Returns:
+            The windows, oldest first, their number, and what was measured of the control intervals.
+        """
+        if number == 0:
+            self.hand_over(live, 0)
+        flights, policy_flew = list[Flight](), False
+        while not policy_flew or self.operation.waiting():
+            if flights and flights[-1].whole and self.config.arm != "model_free":
+                self.belief.virtual.learn(flights[-1].record)  # step 3 fits the last one
+            policy = self.belief.policies["model_free"]  # what the operation has flown already is known from its orders
+            flights.append(self.flights.fly(policy, strength=0.0, whole=self.wanting))
+            versions, counts = flights[-1].transitions["version"].unique(return_counts=True)
+            order = self.operation.orders[int(versions[counts == counts.max()].max())]
+            policy_flew |= order.version > 0 or order.name != FIRST
+            self.keep(flights[-1], order.name, order.weights)
+        report = metrics(
+            windows=float(len(flights)),
+            version=float(order.version),
+            exploration=order.strength,
+            live=order.name,
+            **order.report or {},
+            **self.operation.acted or {},
+        )
+        late = 1e3 * torch.cat([flight.transitions["late"].flatten() for flight in flights])
+        if late.any():
+            report.update(metrics(late_median=late.median(), late_p99=late.quantile(0.99), late_max=late.max()))
+        return flights, report
