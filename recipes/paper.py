@@ -80,7 +80,7 @@ def twinning(options: rt.RunConfig) -> Iterator[dict[str, float | str]]:
         learner.train_policy()
 
         # Step 3, l. 26: the process of the exogenous inputs.
-        process = ExogenousProcess(
+        process = ExogenousProcess.of(
             flown["exogenous"][:, : len(inputs)], dt=plant.dt, signals=inputs, config=table.exogenous
         )
 

@@ -38,6 +38,7 @@ from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.fit.log import Column, checked, read_log
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.settings import module_of
+from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
 
 MODULES = """
@@ -138,7 +139,8 @@ def horizon(**options):
 
 def input_process(values):
     signals = (dataclasses.replace(LQ.inputs[0]),)
-    return ExogenousProcess(torch.as_tensor(values).double().unsqueeze(-1), dt=0.5, signals=signals)
+    record = torch.as_tensor(values).double().unsqueeze(-1)
+    return ExogenousProcess.of(record, dt=0.5, signals=signals, config=ExogenousConfig())
 
 
 def flight(*, policy=None, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1), spoil=None, **options):

@@ -204,7 +204,7 @@ class LoadedRun:
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
 
             acted = inputs[:, : len(signals)]
-            process = ExogenousProcess(
+            process = ExogenousProcess.of(
                 acted, dt=self.physics.dt, signals=signals, config=self.config.twinning.exogenous
             )
         return Snapshot(

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.steps.config import ExogenousConfig, LargeScale
+from rt_torchrl.steps.config import ExogenousConfig
 from rt_torchrl.steps.report import Step, record_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -45,62 +45,40 @@ class ExogenousProcess:
     samples them exactly. The large scales themselves do not vary between realisations, unless they are mixed.
 
     Args:
-        record: exogenous input z at every control interval.
-        dt: control interval [s].
+        mean: large scale d̃.
+        covariance: covariances Γ at the lags 0 to n − 1; Γ at a negative lag is the transpose of Γ at the positive lag.
         signals: signals of the inputs, of which there may be none; samples stay within their physical ranges.
-        config: parameters of step 3.
-
-    Raises:
-        ValueError: if the record holds NaN, or fewer samples than a regression needs.
 
     Source: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, of the sampling.
     """
 
-    def __init__(
-        self,
-        record: Float[Tensor, "n n_z"],
-        *,
-        dt: float,
-        signals: Sequence[Signal],
-        config: ExogenousConfig | None = None,
-    ):
+    def __init__(self, mean: Float[Tensor, "n n_z"], covariance: Float[Tensor, "n n_z n_z"], signals: Sequence[Signal]):
+        self.mean, self.covariance, self._root = mean, covariance, _spectral_root(covariance)
+        self._low, self._high = bounds(signals, dtype=mean.dtype, device=mean.device)
+
+    @classmethod
+    def of(
+        cls, record: Float[Tensor, "n n_z"], *, dt: float, signals: Sequence[Signal], config: ExogenousConfig
+    ) -> "ExogenousProcess":
+        """The process of a record of the input at every control interval ``dt`` [s].
+
+        Raises:
+            ValueError: if the record holds NaN, or fewer samples than a regression needs.
+        """
         if not record.isfinite().all():
             k = (~record.isfinite().all(-1)).nonzero()[0].item()
             raise ValueError(f"record of the exogenous input is not finite at sample {k}, t = {k * dt:g} s; repair it.")
-        config = config or ExogenousConfig()
         like = partial(torch.as_tensor, dtype=record.dtype, device=record.device)
-        self._low, self._high = bounds(signals, dtype=record.dtype, device=record.device)
         # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
         large = np.empty_like(values)
         for k, column in enumerate(values.T):
             large[:, k] = _large_scale(column, config)
         large += (values - large).mean(0)  # what a regression with a tube leaves over, and no sample would have
-        self.mean: Float[Tensor, "n n_z"] = like(large)
-        covariance = like(_windowed_covariance(values - large))
-        self.covariance: Float[Tensor, "n n_z n_z"] = covariance
-        """Covariances Γ at the lags 0 to n − 1; Γ at a negative lag is the transpose of Γ at the positive lag."""
-        self._root = _spectral_root(covariance)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The mean and the covariance, from which :meth:`from_state` rebuilds the process."""
-        return {"mean": self.mean, "covariance": self.covariance}
-
-    @classmethod
-    def from_state(cls, state: dict[str, Tensor], signals: Sequence[Signal]) -> "ExogenousProcess":
-        """The process of a :meth:`state_dict`, for the inputs that it was fitted to."""
-        process = cls.__new__(cls)
-        process.mean, process.covariance = state["mean"], state["covariance"]
-        process._root = _spectral_root(process.covariance)
-        process._low, process._high = bounds(signals, dtype=process.mean.dtype, device=process.mean.device)
-        return process
+        return cls(like(large), like(_windowed_covariance(values - large)), signals)
 
     def sample(
-        self,
-        count: int,
-        generator: torch.Generator,
-        *,
-        large: Float[Tensor, "{count} n n_z"] | None = None,
+        self, count: int, generator: torch.Generator, large: Float[Tensor, "{count} n n_z"] | None = None
     ) -> Float[Tensor, "{count} n n_z"]:
         """Realisations of the input, within the physical ranges of the signals.
 
@@ -120,11 +98,7 @@ class ExogenousProcess:
 
 
 def sample_experience(
-    processes: Sequence[ExogenousProcess],
-    count: int,
-    generator: torch.Generator,
-    *,
-    large_scale: LargeScale = "met",
+    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator, *, mix: bool = False
 ) -> Float[Tensor, "{count} n n_z"]:
     """Realisations from the processes of several episodes, in random order; each is drawn once before any is again.
 
@@ -132,19 +106,21 @@ def sample_experience(
         processes: processes of the episodes.
         count: number of realisations.
         generator: source of the draws.
-        large_scale: see :class:`ExogenousConfig`. Until three episodes can be mixed, they are taken as met.
+        mix: whether their large scales are :func:`mixed` where there are three of them, of which fewer do not tell how
+            much others may differ.
     """
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
-    chosen = torch.cat(order)[:count].tolist()
-    larges = mixed([process.mean for process in processes], count, generator) if large_scale == "mixed" else None
-    rows = zip(chosen, [None] * count if larges is None else larges.split(1), strict=True)
-    return torch.cat([processes[k].sample(1, generator, large=large) for k, large in rows])
+    chosen, larges = torch.cat(order)[:count].tolist(), [None] * count
+    if mix and len(processes) >= ENOUGH:
+        larges = mixed([process.mean for process in processes], count, generator).split(1)
+    pairs = zip(chosen, larges, strict=True)
+    return torch.cat([processes[k].sample(1, generator, large) for k, large in pairs])
 
 
 def mixed(
     larges: Sequence[Float[Tensor, "n n_z"]], count: int, generator: torch.Generator
-) -> Float[Tensor, "{count} n n_z"] | None:
+) -> Float[Tensor, "{count} n n_z"]:
     r"""New large scales, which differ from the mean of those met as these do from each other.
 
     .. math::
@@ -162,27 +138,17 @@ def mixed(
         count: number of new ones.
         generator: source of the new ones.
 
-    Returns:
-        The new ones; None if there are fewer than three, of which nobody can tell how much others may differ.
-
     Source: Owen, Scrambled net variance for integrals of smooth functions, Ann. Statist. 25 (1997) 1541.
     """
-    m = len(larges)
-    if m < ENOUGH:
-        return None
-    stacked = torch.stack(list(larges))
+    m, stacked = len(larges), torch.stack(list(larges))
     centre = stacked.mean(0)
     changes = (stacked - centre) / (stacked - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
     components = torch.linalg.eigh(changes.flatten(1) @ changes.flatten(1).T).eigenvectors.flip(1)
-    weights = _quasi_normal(count, m, generator).to(stacked) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
-    return centre + torch.einsum("cm,mnz->cnz", weights, stacked - centre)
-
-
-def _quasi_normal(count: int, dimensions: int, generator: torch.Generator) -> Float[Tensor, "{count} {dimensions}"]:
-    """Standard normal numbers that fill the space evenly; each draw is distributed as an independent one."""
     seed = int(torch.randint(2**31, (), generator=generator, device=generator.device))
-    unit = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed).draw(count, dtype=torch.float64)
-    return torch.special.ndtri(unit.clamp(2.0**-31, 1.0 - 2.0**-31))
+    unit = torch.quasirandom.SobolEngine(m, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+    normal = torch.special.ndtri(unit.clamp(2.0**-31, 1.0 - 2.0**-31))
+    weights = normal.to(stacked) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
+    return centre + torch.einsum("cm,mnz->cnz", weights, stacked - centre)
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
@@ -363,9 +329,9 @@ class VirtualEpisodes:
         return pieces, [self._process(piece) for piece in pieces]
 
     def _process(self, record: Trajectory) -> ExogenousProcess:
-        plant, signals = self.twin.plant, self.twin.plant.acting_inputs
+        signals = self.twin.plant.acting_inputs
         acted = record.exogenous[:, : len(signals)]
-        return ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config)
+        return ExogenousProcess.of(acted, dt=self.twin.plant.dt, signals=signals, config=self.config)
 
     def draw(self, count: int, *, recorded: bool = False) -> Scenario:
         """Draw initial states, and exogenous inputs from the processes that are kept or as the plant draws them.
@@ -379,16 +345,17 @@ class VirtualEpisodes:
             count: number of virtual episodes.
             recorded: whether they all begin as the last real episode did.
         """
-        plant, large_scale = self.twin.plant, self.config.large_scale
+        plant = self.twin.plant
         if recorded:
             assert self.recorded is not None  # inputs are drawn once a whole episode is known
             initial_state = self.recorded.repeat(count, 1)
         else:
             initial_state = plant.draw_initial_state(count, self.generator)
         set_points = self.set_points.any() and not recorded
-        if large_scale == "drawn" or (set_points and self.set_points.all()):
+        if self.config.large_scale == "drawn" or (set_points and self.set_points.all()):
             return Scenario(initial_state, plant.draw_exogenous(count, self.generator))
-        exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
+        mix = self.config.large_scale == "mixed"
+        exogenous = sample_experience(self.processes, count, self.generator, mix=mix)
         if set_points:
             drawn = plant.draw_exogenous(count, self.generator)[:, : exogenous.shape[1], : exogenous.shape[2]]
             exogenous = torch.where(self.set_points, drawn, exogenous)
@@ -425,13 +392,13 @@ class VirtualEpisodes:
         return Scenario(self.extremes, episodes.exogenous[order])
 
     def state_dict(self) -> dict[str, Any]:
-        return {"processes": [process.state_dict() for process in self.processes], "recorded": self.recorded}
+        processes = [{"mean": process.mean, "covariance": process.covariance} for process in self.processes]
+        return {"processes": processes, "recorded": self.recorded}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        signals = self.twin.plant.acting_inputs
         self.processes.clear()
-        self.processes.extend(
-            ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
-        )
+        self.processes.extend(ExogenousProcess(**saved, signals=signals) for saved in state["processes"])
         self.recorded = state["recorded"]
 
 
