@@ -27,11 +27,11 @@ import copy
 import dataclasses
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import BaseCollector
@@ -47,7 +47,7 @@ from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, Operate, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
-from rt_torchrl.steps.plan import MakePlan, MultiStart, Planner, make_planner
+from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, merged, metrics, on_device
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
@@ -151,15 +151,14 @@ class ReinforcementTwinning(TensorDictSequential):
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
             assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
-        planning, imitation = MultiStart(planner, belief, config.planner, make_policy), Imitation(belief, judged)
-        count = config.planner.realisations or config.realisations
+        counts = (config.planner.realisations or config.realisations, judged)
         steps: dict[str, Any] = {
             "interact": interact,
             "learn": Learn(learner, belief, judged),
             "inputs": FitInputs(virtual),
             "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
-            "plan": MakePlan(planning, count, judged, recorded=config.planner.method == "single_start"),
-            "switch": Switch(referee, policies, belief, imitation, halves, learner.observations, judged),
+            "plan": MultiStart(planner, belief, config.planner, counts, make_policy),
+            "switch": Switch(referee, Imitation(belief, judged), learner, planner),
         }
         super().__init__(OrderedDict((name, steps[name]) for name in ARMS[config.arm]))
         self.closure, self.model_free, self.model_based = twin.closure, model_free, model_based
@@ -292,12 +291,6 @@ class ReinforcementTwinning(TensorDictSequential):
         except BaseException:
             self.model_based.load_state_dict(policy)
             raise
-
-    def select_subsequence(
-        self, in_keys: Iterable[NestedKey] | None = None, out_keys: Iterable[NestedKey] | None = None
-    ) -> TensorDictSequential:
-        """The steps that some keys need, as a sequence without the algorithm's bookkeeping."""
-        return TensorDictSequential(OrderedDict(self.module.items())).select_subsequence(in_keys, out_keys)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the next episode depends on beside policies, closure and the state of the steps."""

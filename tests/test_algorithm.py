@@ -171,5 +171,3 @@ def test_keys_flow_as_the_steps_declare():
     assert record["states"].shape == (n + 1, 2) and record["actions"].shape == record["exogenous"].shape == (n, 1)
     assert len(episode["transitions", "0"]) == n and episode["large_scale"].shape == (n, 1)
     assert set(found.in_keys) == {"number", "live"}
-    arm = found.select_subsequence(out_keys=[("weight_changes", "model_free")])
-    assert list(arm.module) == STEPS[:2]

@@ -44,7 +44,7 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step, we
     sound.assimilation.config = dataclasses.replace(sound.assimilation.config, iterations=0)
     if step == "switch":
         for algorithm in (found, sound):
-            monkeypatch.setattr(algorithm.steps["plan"].planning, "plan", lambda *arguments: metrics())
+            monkeypatch.setattr(algorithm.steps["plan"], "plan", lambda *arguments: metrics())
     report, expected = found.episode(), sound.episode()
     assert report["closure_refused"] == 1.0 and expected["closure_refused"] == 0.0
     assert report["reason"].startswith("closure refused: plant") and "diverged" in report["reason"]

@@ -252,7 +252,7 @@ def test_of_many_weights_those_of_the_output_layer_are_searched(hidden, sizes, m
 def test_policies_are_judged_in_many_episodes_where_ends_are_rare(kind, method, times):
     config = dataclasses.replace(SMALL, planner=rt.PlannerConfig(method=method))
     steps = algorithm(rt.PlantEnv(kind()), kind(), config).steps
-    counts = steps["interact"].judged, steps["plan"].judged, steps["learn"].count
+    counts = steps["switch"].imitation.count, steps["plan"].counts[1], steps["learn"].count
     assert counts == (times * SMALL.virtual_episodes,) * 3
 
 
@@ -279,7 +279,7 @@ def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
     starts, still = torch.zeros(12, 2).double(), torch.zeros(12, plant.n_steps, 1).double()
     planned_on = rt.Scenario(starts[:3].clone(), still[:3])
     starts[7, 0] = 0.9
-    planning = MultiStart(planner, Belief({}, virtual), rt.PlannerConfig())
+    planning = MultiStart(planner, Belief({}, virtual), rt.PlannerConfig(), (1, 1))
     report = planning.plan(1, planned_on, rt.Scenario(starts, still))
     assert [len(starts) for starts in planner.seen] == [3, 8] and planner.seen[1][3] == 0.9
     assert planner.policy.gain.tolist() == STRONG and report["plan_accepted"] == 1.0

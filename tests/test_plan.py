@@ -35,7 +35,7 @@ class Still(WholeEpisodes):
 
 def multi_start(policy, belief, drawn=lambda generator: LinearGain([[4.0, 0.0]]), **options):
     belief.virtual.generator = torch.Generator().manual_seed(5)
-    return MultiStart(Still(policy, belief.virtual), belief, PlannerConfig(**options), drawn)
+    return MultiStart(Still(policy, belief.virtual), belief, PlannerConfig(**options), (1, 1), drawn)
 
 
 def planned_in(planning, episodes=range(1, 17)):
@@ -111,7 +111,7 @@ def test_a_random_start_has_drawn_weights_where_layers_share_them():
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
 def test_starts_that_find_nothing_change_no_training(optimiser, monkeypatch):
     """Nor do they change what the next plan depends on: random numbers, and moments of Adam."""
-    monkeypatch.setattr(MultiStart, "_others", lambda *arguments: iter([(1, gains(-50.0))]))
+    monkeypatch.setattr(MultiStart, "_random", lambda *arguments: gains(-50.0))
     descent = DescentConfig(optimiser=optimiser, rate=0.01 if optimiser == "adam" else 1.0)
     planners = (PlannerConfig(iterations=5, descent=descent, starts=count) for count in (0, 4))
     still = AssimilationConfig(iterations=0)  # a plan on another twin may gain nothing, and then has several starts
@@ -142,7 +142,8 @@ def test_a_plan_that_is_stuck_is_made_from_other_weights_too(limit, led_back, mo
     config = PlannerConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
     virtual = VirtualEpisodes(twin, ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0))
     belief = Belief({"model_based": policy}, virtual)
-    planning = MultiStart(WholeEpisodes(twin, policy, config), belief, config, lambda _: LinearGain([[-1.0, -1.0]]))
+    planner, drawn = WholeEpisodes(twin, policy, config), lambda _: LinearGain([[-1.0, -1.0]])
+    planning = MultiStart(planner, belief, config, (1, 1), drawn)
     report = planning.plan(3, EPISODES, EPISODES)
     assert (virtual.cost(policy, EPISODES) < 1.001) is led_back and ("start" in report) is led_back
 
@@ -199,7 +200,7 @@ class Greedy(Hasty):
 )
 def test_a_plan_that_fails_from_extreme_starts_is_made_again_with_them(wary, extremes, kept):
     policy = LinearGain([[1.0, 1.0]])
-    planning = MultiStart(Greedy(policy, wary), Belief({}, Trapped(extremes)), PlannerConfig())
+    planning = MultiStart(Greedy(policy, wary), Belief({}, Trapped(extremes)), PlannerConfig(), (1, 1))
     report = planning.plan(1, EPISODES, EPISODES)
     assert policy.gain.tolist() == [[kept, kept]] and report["plan_accepted"] == float(kept != 1.0)
 

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -201,8 +201,11 @@ class Plan(NamedTuple):
     report: TensorDict
 
 
-class MultiStart:
-    """Plans from several starts on some virtual episodes, and judges the plans on others; the best one stays.
+class MultiStart(Step):
+    """Step 5: plans from several starts on some virtual episodes are judged on others; the best one stays.
+
+    Reads ``number``, ``J_p`` and ``large_scale``: the twin must have been fitted, and inputs be drawn. Writes
+    ``weight_changes/model_based`` and a report.
 
     A descent begins with the present weights. In the episodes 1, 2 and 4, and where gradients explode in the first plan
     that gains nothing or is refused, the second, the fourth and so on, it also begins with the best of some random
@@ -221,6 +224,7 @@ class MultiStart:
         planner: planner of step 5.
         belief: what policies cost on the real system, and the virtual episodes.
         config: parameters of step 5.
+        counts: numbers of virtual episodes that plans are made on, and judged on.
         make_policy: function that draws a random policy of the same architecture; None for that of the plant, if its
             policies have the same architecture, and else for no random policies.
 
@@ -228,16 +232,21 @@ class MultiStart:
         ValueError: if it draws policies of another architecture.
     """
 
+    in_keys = ["number", "J_p", "large_scale"]
+    out_keys = [("weight_changes", "model_based")]
+
     def __init__(
         self,
         planner: Planner,
         belief: Belief,
         config: PlannerConfig,
+        counts: tuple[int, int],
         make_policy: Callable[[torch.Generator], nn.Module] | None = None,
     ):
-        self.planner, self.belief, self.virtual = planner, belief, belief.virtual
-        fed_back = isinstance(planner.policy, StateFeedback)
-        self.judges = config.method != "single_start" and not fed_back
+        super().__init__(planner=planner)
+        self.planner, self.belief, self.virtual, self.counts = planner, belief, belief.virtual, counts
+        self.recorded, fed_back = config.method == "single_start", isinstance(planner.policy, StateFeedback)
+        self.judges = not self.recorded and not fed_back
         """Whether plans are compared; else every one is kept."""
         self.count = config.starts if config.method == "multi_start" and not fed_back else 0
         self.make_policy = make_policy or self.virtual.twin.plant.make_policy
@@ -250,6 +259,15 @@ class MultiStart:
                 f"make_policy draws a {type(drawn).__name__}, and model_based is another "
                 f"{type(planner.policy).__name__}; let it draw random policies like that one, or use starts=0."
             )
+
+    def forward(self, episode: TensorDictBase) -> TensorDictBase:
+        """Take the step."""
+        policy = self.planner.policy
+        weights = parameters_to_vector(policy.parameters()).detach()
+        planned_on = self.virtual.draw(self.counts[0], recorded=self.recorded)
+        judged_on = self.virtual.draw(self.counts[1]) if self.judges else planned_on
+        report = self.plan(int(episode["number"]) + 1, planned_on, judged_on)
+        return merged(episode, report).set(("weight_changes", "model_based"), weight_change(policy, weights))
 
     def plan(self, episode: int, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
         """Plan; the policy gets the weights that are expected to cost least.
@@ -270,13 +288,15 @@ class MultiStart:
         before = self.belief.judge(policy, judged_on)
         best = self._from_the_present(present, before, planned_on, judged_on)
         several = self._several(episode, best)
-        whole = isinstance(self.planner, WholeEpisodes)
-        corrected = whole and self.belief.corrects and self.belief.contradicted
+        corrected = isinstance(self.planner, WholeEpisodes) and self.belief.corrects and self.belief.contradicted
         flown = self.belief.best_flown(policy, judged_on) if several or corrected else None
-        recalled = [(2, flown[0])] if flown is not None and corrected and flown[1] < before else []
-        if several or recalled:
-            others = self._others(episode, planned_on, flown) if several else recalled
-            new = ((number, weights) for number, weights in others if not equal(weights, present))
+        others: dict[int, Weights] = {}
+        if several and self.alike:
+            others[1] = self._random(episode, planned_on)
+        if flown is not None and (several or flown[1] < before):
+            others[2] = flown[0]
+        if several or others:
+            new = {number: weights for number, weights in others.items() if not equal(weights, present)}
             best = self._best(best, new, planned_on, judged_on)
         if flown is not None and corrected and flown[1] < best.cost:
             best = Plan(*flown, metrics(plan_accepted=0.0, recalled=1.0))
@@ -285,13 +305,11 @@ class MultiStart:
         # Of episodes that plans were not made on: those of a plan that was made again are dear.
         return best.report.update(metrics(J_a_plan_before=before.on_twin, J_a_plan=best.cost.on_twin))
 
-    def _best(
-        self, best: Plan, others: Iterable[tuple[int, Weights]], planned_on: Scenario, judged_on: Scenario
-    ) -> Plan:
-        """The best of a plan and of those from other weights; the policy gets its weights."""
+    def _best(self, best: Plan, others: Mapping[int, Weights], planned_on: Scenario, judged_on: Scenario) -> Plan:
+        """The best of a plan and of those from other weights, by the number of their start; the policy gets it."""
         after, start = copy.deepcopy(self.planner.state_dict()), 0
         policy = self.planner.policy
-        for number, weights in others:
+        for number, weights in others.items():
             policy.load_state_dict(weights)
             self.planner.restart()
             try:
@@ -371,15 +389,6 @@ class MultiStart:
         self._stalled = self._stalled + 1 if stalled else 0
         return episode in SEVERAL or self._stalled.bit_count() == 1
 
-    def _others(
-        self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None
-    ) -> Iterator[tuple[int, Weights]]:
-        """Other weights to begin with, and the number by which ``start`` reports their kind."""
-        if self.alike:
-            yield 1, self._random(episode, planned_on)
-        if flown is not None:
-            yield 2, flown[0]
-
     @torch.no_grad()
     def _random(self, episode: int, planned_on: Scenario) -> Weights:
         """The weights of the random policy that costs least on the twin; what is not trained is not drawn."""
@@ -400,44 +409,15 @@ class MultiStart:
         policy.load_state_dict(kept)
         return best[1]
 
-    def state_dict(self) -> dict[str, Any]:
-        """For how many plans gradients have exploded."""
-        return {"stalled": self._stalled}
+    def get_extra_state(self) -> dict[str, Any]:
+        """The state of the planner, and for how many plans gradients have exploded."""
+        return super().get_extra_state() | {"stalled": self._stalled}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from the :meth:`state_dict` of another one with the same planner."""
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        super().set_extra_state(state)
         self._stalled = state["stalled"]
 
 
 def planned(plan: Descended) -> TensorDict:
     """The report of a plan that is kept."""
     return metrics(J_a_plan_before=plan.start, J_a_plan=plan.best, policy_gradient=plan.gradient, plan_accepted=1.0)
-
-
-class MakePlan(Step):
-    """Step 5: the planner improves π_mb on the twin with w_p*; a plan stays if it is expected to cost less.
-
-    Reads ``number``, ``J_p`` and ``large_scale``: the twin must have been fitted, and inputs be drawn. Writes
-    ``weight_changes/model_based`` and the report of :class:`MultiStart`.
-
-    Args:
-        planning: the plans of an episode.
-        count: number N_z of virtual episodes that plans are made on.
-        judged: number of virtual episodes on which they are judged.
-        recorded: whether plans are made from the initial state of the last real episode.
-    """
-
-    in_keys = ["number", "J_p", "large_scale"]
-    out_keys = [("weight_changes", "model_based")]
-
-    def __init__(self, planning: MultiStart, count: int, judged: int, *, recorded: bool = False):
-        super().__init__(planner=planning.planner, planning=planning)
-        self.planning, self.count, self.judged, self.recorded = planning, count, judged, recorded
-
-    def forward(self, episode: TensorDictBase) -> TensorDictBase:
-        policy, virtual = self.planning.planner.policy, self.planning.virtual
-        weights = parameters_to_vector(policy.parameters()).detach()
-        planned_on = virtual.draw(self.count, recorded=self.recorded)
-        judged_on = virtual.draw(self.judged) if self.planning.judges else planned_on
-        report = self.planning.plan(int(episode["number"]) + 1, planned_on, judged_on)
-        return merged(episode, report).set(("weight_changes", "model_based"), weight_change(policy, weights))

@@ -1,14 +1,12 @@
 """Step 6: a referee says which policy acts next, and whether the idle one becomes a clone of it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
 
-from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ROLES, RefereeConfig, Role
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.learn import Learner
@@ -147,30 +145,18 @@ class Switch(Step):
 
     Args:
         referee: the referee.
-        policies: both policies by role.
-        belief: what policies cost.
-        imitation: clones.
-        halves: learner and planner by role, of which the one whose policy becomes a clone starts afresh.
-        seen: function that gives observations of the real system.
-        count: number N of virtual episodes.
+        imitation: clones, which know what policies cost, and the number N of virtual episodes.
+        learner: learner, which knows observations of the real system.
+        planner: planner; the one of both whose policy becomes a clone starts afresh.
     """
 
     in_keys = ["live", "record", ("weight_changes", "model_free"), ("weight_changes", "model_based")]
     out_keys = ["event", "J_a_model_based", "J_a_model_free"]
 
-    def __init__(
-        self,
-        referee: Referee,
-        policies: Mapping[Role, nn.Module],
-        belief: Belief,
-        imitation: Imitation,
-        halves: Mapping[Role, Learner | Planner],
-        seen: Callable[[], Tensor],
-        count: int,
-    ):
+    def __init__(self, referee: Referee, imitation: Imitation, learner: Learner, planner: Planner):
         super().__init__(referee=referee)
-        self.referee, self.policies, self.belief, self.imitation = referee, dict(policies), belief, imitation
-        self.halves, self.seen, self.count = halves, seen, count
+        self.referee, self.imitation, self.belief = referee, imitation, imitation.belief
+        self.learner, self.planner = learner, planner
 
     @torch.no_grad()
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
@@ -179,27 +165,23 @@ class Switch(Step):
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        judged_on, live = self.belief.virtual.draw(self.count), self.referee.live
-        idle = other_than(live)
-        costs = {role: self.belief.judge(self.policies[role], judged_on) for role in ROLES}
+        belief, live = self.belief, self.referee.live
+        judged_on, idle = belief.virtual.draw(self.imitation.count), other_than(live)
+        costs = {role: belief.judge(belief.policies[role], judged_on) for role in ROLES}
         diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].on_twin)]
         if diverged:
-            self.belief.require_sound_twin(judged_on)
-        evidence = Evidence(
-            live_cost=costs[live].expected,
-            idle_cost=costs[idle].expected,
-            # Weights whose step was left out, because the twin diverged, are as they were.
-            idle_weight_change=float(episode.get(("weight_changes", idle), 0.0)),
-        )
-        event = self.referee.decide(evidence)
-        report = metrics(*diverged, **{f"J_a_{role}": costs[role].on_twin for role in ROLES})
-        report = report.update(metrics(weight_change=evidence.idle_weight_change)).set_non_tensor("event", event)
+            belief.require_sound_twin(judged_on)
+        # Weights whose step was left out, because the twin diverged, are as they were.
+        change = float(episode.get(("weight_changes", idle), 0.0))
+        event = self.referee.decide(Evidence(costs[live].expected, costs[idle].expected, change))
+        on_twin = {f"J_a_{role}": costs[role].on_twin for role in ROLES}
+        report = metrics(*diverged, **on_twin, weight_change=change, event=event)
         if event == "clone":
-            policies, record = (self.policies[live], self.policies[idle]), record_of(episode)
+            policies, record = (belief.policies[live], belief.policies[idle]), record_of(episode)
             if episode["live"] != live:  # another one flew, whose actions say nothing of this one
                 record = record.part(0, 0, 0.0)
-            cloned = self.imitation.clone(*policies, seen=self.seen, record=record, judged_on=judged_on)
+            cloned = self.imitation.clone(*policies, seen=self.learner.observations, record=record, judged_on=judged_on)
             if "reason" not in cloned:
-                self.halves[idle].restart()
+                (self.learner if idle == "model_free" else self.planner).restart()
             report = merged(report, cloned)
         return merged(episode, report)
