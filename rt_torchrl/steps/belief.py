@@ -24,7 +24,7 @@ the sensors (:func:`~rt_torchrl.fit.sensors.noise_levels`) explains, is believed
 import contextlib
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -134,9 +134,8 @@ class Belief:
         self.first: list[FirstFlown] = []
         """The latest episodes of the controller that flew first."""
         self._policy_flew = True
-        self._costs: tuple[Any, list[float]] | None = None
-        self._by_noise = dict[int, tuple[float, float]]()
-        self._anchored: tuple[Any, Anchors | None] | None = None
+        self._state: dict[str, Any] | None = None
+        self._results: dict[str | int, Any] = {}
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
         virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
@@ -168,7 +167,16 @@ class Belief:
         if commands is not None:
             flown = flown._replace(deviation=self._deviation(flown, commands))
         self.flown = [*self.flown, flown][-HISTORY:]
-        self._costs, self._anchored, self._policy_flew = None, None, True
+        self._state, self._policy_flew = None, True
+
+    def _kept(self, name: str | int, compute: Callable[[], Any]) -> Any:
+        """What is computed of the present twin and the episodes, once until one of both changes."""
+        state = self.virtual.twin.state_dict() | {"noise": self.virtual.twin.noise}
+        if self._state is None or not equal(state, self._state):
+            self._state, self._results = copy.deepcopy(state), {}
+        if name not in self._results:
+            self._results[name] = compute()
+        return self._results[name]
 
     @torch.no_grad()
     def _deviation(self, flown: Flown, commands: Float[Tensor, "n n_a"]) -> Float[Tensor, "1 n n_a"] | None:
@@ -220,10 +228,14 @@ class Belief:
         if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
         episodes = [self.virtual.repeated(flight.trajectory) for flight in self.first]
-        cost = sum(self.virtual.cost(policy, episode) for episode in episodes) / len(episodes)
+
+        def on_twin(module: nn.Module) -> float:
+            return sum(self.virtual.cost(module, episode) for episode in episodes) / len(episodes)
+
+        cost = on_twin(policy)
         if self.flown:
             return self.expected(policy, cost), paid
-        controller_cost = sum(self.virtual.cost(controller, episode) for episode in episodes) / len(episodes)
+        controller_cost = on_twin(controller)
         return (paid * cost / controller_cost if 0.0 < controller_cost < math.inf else math.inf), paid
 
     def policy_of(self, flown: Flown) -> nn.Module:
@@ -248,18 +260,14 @@ class Belief:
 
     def _predicted(self) -> list[float]:
         """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
-        virtual, twin = self.virtual, self.virtual.twin
-        state = twin.state_dict() | {"noise": twin.noise}
-        if self._costs is None or not equal(state, self._costs[0]):
-            costs = list[float]()
-            for flown in self.flown:
-                if isinstance(self.policies[flown.role], StateFeedback):
-                    costs.append(math.nan)
-                else:
-                    episode = virtual.repeated(flown.trajectory)
-                    costs.append(virtual.cost(self.policy_of(flown), episode, explored(flown, episode)))
-            self._costs, self._by_noise = (copy.deepcopy(state), costs), {}
-        return self._costs[1]
+        costs: list[float] = self._kept("costs", lambda: [self._flown_again(flown) for flown in self.flown])
+        return costs
+
+    def _flown_again(self, flown: Flown) -> float:
+        if isinstance(self.policies[flown.role], StateFeedback):
+            return math.nan
+        episode = self.virtual.repeated(flown.trajectory)
+        return self.virtual.cost(self.policy_of(flown), episode, explored(flown, episode))
 
     def _beyond_noise(self, k: int, d: float) -> float:
         """The paired difference d of an episode beyond what other noise of the sensors explains of a large one.
@@ -268,12 +276,7 @@ class Belief:
         """
         if not NOISE < abs(d) < DEARER:
             return d
-        if k not in self._by_noise:
-            try:
-                self._by_noise[k] = self._explained_by_noise(self.flown[k])
-            except DivergenceError:
-                self._by_noise[k] = 0.0, 0.0
-        least, greatest = self._by_noise[k]
+        least, greatest = self._kept(k, lambda: self._explained_by_noise(self.flown[k]))
         return d - min(max(d, least), greatest)
 
     @torch.no_grad()
@@ -281,10 +284,7 @@ class Belief:
         """The least and the greatest paired difference of an episode that noise of the sensors explains.
 
         They are two standard deviations from the mean of what flights of the twin cost with other noise over that with
-        the noise that its costs have, and hold what a flight without noise costs.
-
-        Raises:
-            DivergenceError: if the twin diverges with the noise.
+        the noise that its costs have, and hold what a flight without noise costs; zeros where the twin diverges.
         """
         twin, (starts, inputs) = self.virtual.twin.believed, self.virtual.repeated(flown.trajectory)
         levels, policy = self.virtual.twin.noise, self.policy_of(flown)
@@ -294,9 +294,12 @@ class Belief:
         noise[1:] = levels * torch.randn(noise[1:].shape, generator=torch.Generator().manual_seed(0)).to(noise)
         true_starts = twin.plant.at_rest(starts - noise[:, 0])  # of which the readings are those of the episode
         scenario = Scenario(true_starts, torch.cat([inputs.expand(len(noise), -1, -1), noise], -1))
-        costs = twin.noisy.episode_costs(policy, *scenario, explored(flown, scenario))
         episode = Scenario(twin.plant.at_rest(starts), inputs)
-        logs = (costs / twin.episode_costs(policy, *episode, explored(flown, episode))).log()
+        try:
+            costs = twin.noisy.episode_costs(policy, *scenario, explored(flown, scenario))
+            logs = (costs / twin.episode_costs(policy, *episode, explored(flown, episode))).log()
+        except DivergenceError:
+            return 0.0, 0.0
         mean, spread = logs[1:].mean().item(), 2.0 * logs[1:].std().item()
         ends = (0.0, logs[0].item(), mean - spread, mean + spread)
         return (min(ends), max(ends)) if all(map(math.isfinite, ends)) else (0.0, 0.0)
@@ -403,27 +406,23 @@ class Belief:
 
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
-        twin = self.virtual.twin
-        state = twin.state_dict() | {"noise": twin.noise}
-        if self._anchored is None or not equal(state, self._anchored[0]):
-            self._anchored = copy.deepcopy(state), self._anchors_on(twin.believed)
-        return self._anchored[1]
+        anchors: Anchors | None = self._kept("anchors", lambda: self._anchors_on(self.virtual.twin.believed))
+        return anchors
 
     @torch.no_grad()
     def _anchors_on(self, twin: DigitalTwin) -> "Anchors | None":
         if not self.contradicted:
             return None
-        whole, inputs, differences = list[Flown](), list[Tensor](), list[float]()
+        known = list[tuple[Flown, Tensor, float]]()
         for flown, predicted, d in zip(self.flown, self._predicted(), self.differences(), strict=True):
             exogenous = self.virtual.repeated(flown.trajectory).exogenous
             # State feedback is no function of an observation, a part of an episode has another cost, and where the
             # twin diverges, or nearly does, nothing is near.
             if exogenous.shape[1] == twin.plant.n_steps and math.isfinite(predicted) and d > -DEARER:
-                whole.append(flown)
-                inputs.append(exogenous)
-                differences.append(d)
-        if not whole:
+                known.append((flown, exogenous, d))
+        if not known:
             return None
+        whole, inputs, differences = zip(*known, strict=True)
         anchored = self._twins.get(twin)
         if anchored is None or anchored.closure is not twin.closure:
             anchored = self._twins[twin] = twin.of(Anchored(twin.plant))
@@ -510,16 +509,15 @@ class Belief:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        flown: dict[str, Sequence[Flown | FirstFlown]] = {"flown": self.flown, "first": self.first}
-        return {
-            name: [flight._asdict() | {"trajectory": flight.trajectory._asdict()} for flight in flights]
-            for name, flights in flown.items()
-        }
+        def saved(flights: Sequence[Flown | FirstFlown]) -> list[dict[str, Any]]:
+            return [flight._asdict() | {"trajectory": flight.trajectory._asdict()} for flight in flights]
+
+        return {"flown": saved(self.flown), "first": saved(self.first)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.flown = [Flown(**saved | {"trajectory": Trajectory(**saved["trajectory"])}) for saved in state["flown"]]
         self.first = [FirstFlown(Trajectory(**saved["trajectory"]), saved["cost"]) for saved in state["first"]]
-        self._costs = self._anchored = None
+        self._state = None
 
 
 def explored(flown: Flown, episodes: Scenario) -> Actions | None:
@@ -553,11 +551,8 @@ def alarm(differences: Sequence[float]) -> str | None:
         last = [d for d in last[-1:] if abs(d) > 2.0 * ALARM]
     if not last:
         return None
-    mean, n = sum(last) / len(last), len(last)
-    ratio = math.exp(abs(mean))
-    episodes = "the last episode cost" if n == 1 else f"the last {n} episodes cost"
-    relation = f"{ratio:.3g} times as much as" if mean > 0.0 else f"1/{ratio:.3g} of what"
-    return f"the twin is wrong where it matters: {episodes} {relation} the twin says of {'it' if n == 1 else 'them'}"
+    ratio, n = math.exp(sum(last) / len(last)), len(last)
+    return f"the twin is wrong where it matters: the latest real costs ({n}) were {ratio:.3g} times what it says"
 
 
 def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
