@@ -119,10 +119,7 @@ class Config(rt.RunConfig):
         """The turbine as its twin knows it."""
         wind = None
         if self.wind_files:
-            try:
-                wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
-            except (ValueError, OSError) as error:
-                raise ValueError(f"wind_files: {error}") from error
+            wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
         usual = "paper" if self.preset == "paper" and self.policy == "mlp" else OBSERVED[self.policy]
         cost = self.engineering if self.task == "engineering" else PaperCost()
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))

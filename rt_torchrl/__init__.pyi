@@ -16,7 +16,7 @@ from .plants.extension import ExtendedClosure, Extension
 from .plants.vector_field import NeuralResidual
 from .plants.plant import Plant, Transition
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
-from .plants.sampling import require_request, require_stable_step, rk4_step
+from .plants.sampling import require_stable_step, rk4_step
 from .plants.sensors import BiasedSensor
 from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .plants.sensors import StackedObservations
@@ -216,7 +216,6 @@ __all__ = [
     "main_of",
     "read_log",
     "require_device",
-    "require_request",
     "require_stable_step",
     "rk4_step",
     "sensor_record",

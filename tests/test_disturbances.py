@@ -163,16 +163,16 @@ def patched(content, offset, form, value):
 @pytest.mark.parametrize(
     "spoil, message",
     [
-        (lambda c: c[:-100], "is truncated, it holds 6579 bytes, but its header .* implies 6679 bytes"),
-        (lambda c: c + b"\0", "is too long, it holds 6680 bytes, but its header .* implies 6679 bytes"),
-        (lambda c: c[:30], "is truncated, it holds 30 bytes, but the header alone takes 70 bytes"),
-        (lambda c: patched(c, 0, "<h", 4), "begins with the number 4, but a TurbSim full field begins with 7 or 8"),
-        (lambda c: patched(c, 2, "<i", -5), "header is corrupt, .*n_z=-5"),
-        (lambda c: patched(c, 42, "<f", 0.0), "header is corrupt, .*u_slope=0.0"),
+        (lambda c: c[:-100], "holds 6579 bytes, but its header implies 6679 bytes"),
+        (lambda c: c + b"\0", "holds 6680 bytes, but its header implies 6679 bytes"),
+        (lambda c: c[:30], "holds 30 bytes, but the header alone takes 70 bytes"),
+        (lambda c: patched(c, 0, "<h", 4), "is no TurbSim full field, .*identifier=4"),
+        (lambda c: patched(c, 2, "<i", -5), "is no TurbSim full field, .*n_z=-5"),
+        (lambda c: patched(c, 42, "<f", 0.0), "is no TurbSim full field, .*u_slope=0.0"),
         (lambda c: patched(c, 34, "<f", 101.0), r"the hub lies outside the height of the grid, 4\.1 spacings"),
         # n_z, n_y, n_tower, n_t and the length of the description, all as great as they can be declared.
         *(
-            (lambda c, at=at: patched(c, at, "<i", 2**31 - 1), "is truncated, it holds 6679 bytes")
+            (lambda c, at=at: patched(c, at, "<i", 2**31 - 1), "holds 6679 bytes, but its header implies")
             for at in (2, 6, 10, 14, 66)
         ),
     ],

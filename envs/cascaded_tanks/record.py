@@ -23,38 +23,20 @@ def read_benchmark(path: Path | None) -> Benchmark:
     """The record from a CSV file with the benchmark's columns, or else from the package ``nonlinear-benchmarks``.
 
     Raises:
-        ValueError: if the file cannot be read or lacks a column or a number, or the package is not installed or cannot
-            load the record.
+        ValueError: if the file cannot be read, or lacks a column or a number.
     """
     if path is None:
-        return _packaged()
-    try:
-        with open(path, encoding="utf-8") as file:
-            header = [name.strip().strip('"') for name in file.readline().strip().split(",")]
-            table = np.genfromtxt(file, delimiter=",", usecols=range(len(header)), filling_values=np.nan)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"data={path} cannot be read: {error}") from error
-    missing = [name for name in COLUMNS if name not in header]
-    if missing:
-        raise ValueError(f"data={path} has the columns {', '.join(header)}; it needs {', '.join(missing)}, too.")
-    columns = [np.atleast_2d(table)[:, header.index(name)] for name in COLUMNS]
-    if not all(np.isfinite(column).all() for column in columns):
-        raise ValueError(f"data={path}: a number is missing in the columns {', '.join(COLUMNS)}.")
-    return Benchmark(*columns)
+        from nonlinear_benchmarks import Cascaded_Tanks  # which downloads the record at its first use
 
-
-def _packaged() -> Benchmark:
-    try:
-        from nonlinear_benchmarks import Cascaded_Tanks
-    except ImportError as error:
-        raise ValueError(
-            "the record needs a package: pip install nonlinear-benchmarks, or give a file, --data FILE."
-        ) from error
-    try:
         estimation, test = Cascaded_Tanks()
-    except Exception as error:  # whatever a download can raise
+        return Benchmark(*(np.ravel(x).astype(float) for x in (estimation.u, estimation.y, test.u, test.y)))
+    try:
+        table = np.genfromtxt(path, delimiter=",", names=True, deletechars='"', encoding="utf-8", ndmin=1)
+    except (OSError, ValueError, IndexError) as error:
+        raise ValueError(f"data={path} cannot be read: {error}") from error
+    names = table.dtype.names or ()
+    if not (set(COLUMNS) <= set(names) and all(np.isfinite(table[name]).all() for name in COLUMNS)):
         raise ValueError(
-            f"the package nonlinear-benchmarks cannot load the record ({error}); give a file, --data FILE, with the "
-            f"columns {', '.join(COLUMNS)}."
-        ) from error
-    return Benchmark(*(np.ravel(x).astype(float) for x in (estimation.u, estimation.y, test.u, test.y)))
+            f"data={path} must have a number in every row of {', '.join(COLUMNS)}; it has {', '.join(names)}."
+        )
+    return Benchmark(*(table[name] for name in COLUMNS))

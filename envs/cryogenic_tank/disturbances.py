@@ -1,20 +1,16 @@
 """The exogenous input of the tank: the heat load of an orbit in and out of the sun."""
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
-from rt_torchrl.options import require_range
-from rt_torchrl.plants.sampling import require_request
+from rt_torchrl.options import NotNegative, Positive, configuration
 from rt_torchrl.plants.shapes import Draws
 
-LOWEST = 600.0
-"""Time that no orbit takes: one close to the ground of the Earth takes 5060 s [s]."""
 
-
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class CyclicLoad:
     r"""Gaussian peaks once per orbit over a least load, with uniform noise (paper, section 5.3).
 
@@ -39,20 +35,12 @@ class CyclicLoad:
         ValueError: if an argument is out of its range.
     """
 
-    minimum: float = 50.0
-    peak: float = 250.0
-    variation: float = 0.1
-    period: float = 5400.0
-    width: float = 675.0
-    noise: float = 25.0
-
-    def __post_init__(self) -> None:
-        for name in ("minimum", "peak", "noise"):
-            require_range(name, getattr(self, name), 0.0, 1e5, unit="W", of="CyclicLoad")
-        for name, least in (("period", LOWEST), ("width", 1.0)):
-            require_range(name, getattr(self, name), least, 1e7, unit="s", of="CyclicLoad")
-        if not 0.0 <= self.variation <= 1.0:
-            raise ValueError(f"variation={self.variation} of CyclicLoad must be in [0, 1], a fraction of the peak.")
+    minimum: NotNegative = 50.0
+    peak: NotNegative = 250.0
+    variation: Annotated[float, Field(ge=0, le=1)] = 0.1
+    period: Annotated[float, Field(ge=600)] = 5400.0  # an orbit close to the ground of the Earth takes 5060 s
+    width: Positive = 675.0
+    noise: NotNegative = 25.0
 
     @property
     def mean(self) -> float:
@@ -67,11 +55,7 @@ class CyclicLoad:
             n_steps: number of samples of each episode.
             dt: sampling interval [s].
             generator: source of the peaks' heights and of the noise.
-
-        Raises:
-            ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
-        require_request(batch, n_steps, dt)
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         t = dt * torch.arange(n_steps, **like)
         orbit = (t / self.period).floor().long()

@@ -163,14 +163,13 @@ class CryogenicTank(Plant):
         closure: closure of the real tank, from :meth:`features` to U_s, U_HX, K_JT; None for the paper's constants.
         load: source of the heat load.
         fluid: pure fluid in the tank, one of those of :mod:`saturation`.
-        wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         cost: running and terminal cost of J_a; None for the paper's.
         command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
             open. A half-open valve takes less heat per mass that it vents.
         observe: names of ``measurements`` and ``observation_sets``; by default the paper's error.
 
     Raises:
-        ValueError: for an unknown fluid or command, a size that is not positive, or a wall too light for the step.
+        ValueError: for an unknown fluid or command, or a wall that is too fast for the step.
     """
 
     name = "cryogenic_tank"
@@ -181,6 +180,7 @@ class CryogenicTank(Plant):
     first_pressure_spread = 25e3  # standard deviation of p(0) [Pa]
     error_unit = 10e3  # [Pa]
     wall_area = 74.1  # A_s [m²]
+    wall_heat_capacity = 500e3  # m_s c_s [J/K]
     back_pressure = STATES[2].low  # least p_1 [Pa], held by a regulator at the end of the vent line
     superheat_unit = 0.05  # typical T_s − T [K]
     rated_valve = ConstantCoefficients.true_coefficients[2]  # K_JT of the valve's data sheet, for the cost [Pa s²/kg²]
@@ -216,7 +216,6 @@ class CryogenicTank(Plant):
         closure: nn.Module | None = None,
         load: DisturbanceModel | None = None,
         fluid: str = "Hydrogen",
-        wall_heat_capacity: float = 500e3,
         cost: TankCost | None = None,
         command: Literal["drop", "duty"] = "drop",
         observe: Sequence[str] = (),
@@ -225,15 +224,12 @@ class CryogenicTank(Plant):
         super().__init__(dt=dt, horizon=horizon, closure=constants, observe=observe)
         if command not in COMMANDS:
             raise ValueError(f"command={command!r} does not exist; choose one of {', '.join(COMMANDS)}.")
-        if not 0.0 < wall_heat_capacity < math.inf:
-            raise ValueError(f"wall_heat_capacity={wall_heat_capacity} J/K must be positive and finite.")
         self.load = CyclicLoad() if load is None else load
-        self.wall_heat_capacity = float(wall_heat_capacity)
         self.command, self.actions = command, (COMMANDS[command],)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid)
-        mode, rate = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K", self.wall_rate(self.closure)
-        require_stable_step(self.name, dt, rate, mode=mode, remedy="a heavier wall")
+        rate = self.wall_rate(self.closure)
+        require_stable_step(self.name, dt, rate, mode="the wall", remedy="a closure with a smaller U_s")
 
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:

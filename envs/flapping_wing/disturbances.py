@@ -1,20 +1,16 @@
 """The exogenous input of the flapping wing: a gusty headwind."""
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
-from rt_torchrl.options import require_range
-from rt_torchrl.plants.sampling import require_request
+from rt_torchrl.options import configuration
 from rt_torchrl.plants.shapes import Draws
 
-GREATEST = 30.0
-"""Speed of a wind in which no drone flies [m/s]."""
 
-
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class GaussianGust:
     r"""Stationary Gaussian process with a squared-exponential kernel (paper, section 5.2).
 
@@ -47,15 +43,9 @@ class GaussianGust:
     Source: Dietrich and Newsam, *SIAM J. Sci. Comput.* 18 (1997) 1088.
     """
 
-    mean: float = 1.0
-    std: float = 1.0
-    time_scale: float = 3.0
-
-    def __post_init__(self) -> None:
-        of = "GaussianGust"
-        require_range("mean", self.mean, -GREATEST, GREATEST, unit="m/s", of=of)
-        require_range("std", self.std, 0.0, GREATEST, unit="m/s", of=of)
-        require_range("time_scale", self.time_scale, 0.01, 3600.0, unit="s", of=of)
+    mean: Annotated[float, Field(ge=-30, le=30)] = 1.0  # no drone flies in faster wind
+    std: Annotated[float, Field(ge=0, le=30)] = 1.0
+    time_scale: Annotated[float, Field(gt=0, le=3600)] = 3.0
 
     def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Headwind u_∞ [m/s] of ``batch`` independent episodes, in float64 on the generator's device.
@@ -65,11 +55,7 @@ class GaussianGust:
             n_steps: number of samples of each episode.
             dt: sampling interval [s].
             generator: source of the coefficients a_k and b_k.
-
-        Raises:
-            ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
-        require_request(batch, n_steps, dt)
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         reach = 9.0  # kernel and spectrum are below rounding there: e^{−9²/2} = e^{−40}
         period = n_steps * dt + reach * self.time_scale

@@ -5,7 +5,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
@@ -31,25 +30,12 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 
 
 def flight_path(snapshot: Snapshot) -> Figure:
-    """The last flight in the vertical plane with a mark at each second; wind and distance to the target over time.
+    """The last flight in the vertical plane with a mark at each second.
 
     The axes span the real flight and the target; a twin that flies elsewhere leaves them.
     """
-    title = f"Flight path, {style.episode(snapshot)}"
-    figure, axes = style.panels(2, 2, title=title, size=(11.0, 5.8), width_ratios=(1.35, 1.0))
-    (path, wind), (below, distance) = axes
-    below.remove()
-    path.set_subplotspec(path.get_gridspec()[:, 0])
-    wind.sharex(distance)
-    _draw_path(path, snapshot)
-    _draw_wind(wind, snapshot)
-    _draw_distance(distance, snapshot)
-    style.legend_below(figure, [path])
-    return figure
-
-
-def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
+    figure, ((ax,),) = style.panels(1, title=f"Flight path, {style.episode(snapshot)}", size=(7.0, 5.8))
     ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label=style.record_label(snapshot))
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
     ax.plot(*array(plant.target), "*", color=style.REFERENCE, markersize=15, label="target")
@@ -62,40 +48,8 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     caption(ax, "vertical plane")
     ax.set_xlabel(plant.states[0].label)
     ax.set_ylabel(plant.states[1].label)
-
-
-def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
-    plant = cast(FlappingWing, snapshot.plant)
-    recorded, strongest = array(snapshot.record.exogenous)[:, 0], float(plant.strongest_wind)
-    time = style.time_axis(plant, len(recorded))[0][:-1]
-    ax.plot(time, recorded, color=REAL, linewidth=1.9, label="recorded")
-    if snapshot.large_scale is not None:
-        mean = array(snapshot.large_scale)[:, 0]
-        ax.plot(time, mean, color=style.LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
-    ax.axhline(strongest, **style.LIMIT_LINE)
-    # The text stands under the line itself, because the legend has no room for it.
-    text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "top"}
-    ax.annotate("strongest that can be held", (0.99, strongest), xycoords=("axes fraction", "data"), **text)
-    ax.set_ylim(min(0.0, recorded.min()) - 0.2, 1.15 * max(strongest, recorded.max()))
-    caption(ax, plant.inputs[0].label)
-    style.legend_above(ax)
-    ax.tick_params(labelbottom=False)
-
-
-def _draw_distance(ax: Axes, snapshot: Snapshot) -> None:
-    plant = cast(FlappingWing, snapshot.plant)
-    real, twin = (
-        np.linalg.norm(array(states[:, :2] - plant.target), axis=1)
-        for states in (snapshot.record.states, snapshot.replay)
-    )
-    time, label = style.time_axis(plant, len(real) - 1)
-    ax.plot(time, real, color=REAL, linewidth=1.9, label=style.record_label(snapshot))
-    ax.plot(time, twin, color=TWIN, linewidth=1.0, label=style.twin_label(snapshot))
-    ax.set_yscale("log")
-    style.plain_numbers(ax)
-    caption(ax, "distance to the target [m]", f"at the end {real[-1]:.2g} m, twin {twin[-1]:.2g} m")
-    ax.set_xlabel(label)
-    ax.set_xlim(time[0], time[-1])
+    style.legend_below(figure, [ax])
+    return figure
 
 
 def flight(snapshot: Snapshot) -> Figure:
@@ -143,9 +97,8 @@ def polars(snapshot: Snapshot) -> Figure:
     visited = visited_features(snapshot)
     C = {name: closure(visited) for name, closure in style.closures(snapshot).items()}
     rms = {name: array((C[name] - C["true"]).square().mean(0).sqrt()) for name in ("twin", "initial twin")}
-    title = "\n".join(["Polars of the wing", *_coefficients(snapshot)])
     label, size = r"effective angle of attack $\alpha_e$ [deg]", (7.5, 8.4)
-    figure, axes = style.grid(3, title=title, size=size, xlabel=label, height_ratios=(2.0, 2.0, 1.0))
+    figure, axes = style.grid(3, title="Polars of the wing", size=size, xlabel=label, height_ratios=(2.0, 2.0, 1.0))
     angle = torch.linspace(-180.0, 180.0, 361, dtype=visited.dtype, device=visited.device)
     around = torch.stack([angle.deg2rad().sin(), angle.deg2rad().cos()], -1)
     for name, closure in style.closures(snapshot).items():
@@ -173,16 +126,6 @@ def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     plant = cast(FlappingWing, snapshot.plant)
     element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
     return features_of(plant, snapshot.record)[:, element]
-
-
-def _coefficients(snapshot: Snapshot) -> list[str]:
-    """A line for each law that names its coefficients."""
-    coefficients = {name: getattr(law, "named_coefficients", None) for name, law in style.closures(snapshot).items()}
-    return [
-        f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in named().items())
-        for name, named in coefficients.items()
-        if named is not None
-    ]
 
 
 def control_surfaces(snapshot: Snapshot) -> Figure:

@@ -15,7 +15,7 @@ from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.options import NotNegative, configuration, require_range
 from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.plants.sampling import DisturbanceModel, between, lag, require_stable_step
+from rt_torchrl.plants.sampling import DisturbanceModel, between, lag
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Phase, Signal
 
@@ -154,7 +154,7 @@ class FlappingWing(Plant):
 
     Raises:
         ValueError: for a mass or target that a drone of this kind cannot have, an unknown measurement, or a step
-            that is unstable or does not resolve the wing beat.
+            that does not resolve the wing beat.
     """
 
     name = "flapping_wing"
@@ -169,7 +169,6 @@ class FlappingWing(Plant):
     span_nodes = 6  # positions after 2 s differ by 2e-6 m from those with forty nodes
     body_drag_area = 5e-4  # S_b C_D,b [m²]
     smallest_airspeed = 0.01  # ε [m/s], the floor of |U|
-    strongest_wind = 2.554  # [m/s]; the trim in it needs β_w = −30 deg
     least_steps_per_beat = 20
 
     states: tuple[Signal, ...] = POSITIONS + SPEEDS
@@ -240,30 +239,12 @@ class FlappingWing(Plant):
         self.register_buffer("radius", self.wing_root + self.wing_length * theta.sin())
         # The two wings have ½ρ c dr each.
         self.register_buffer("strip_mass", self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
-        self._require_resolved_step()
-
-    def _require_resolved_step(self) -> None:
         longest = 1.0 / (self.least_steps_per_beat * self.frequency)
-        if self.dt > longest * (1.0 + 1e-9):
+        if dt > longest * (1.0 + 1e-9):
             raise ValueError(
-                f"dt={self.dt} s does not resolve the wing beat of plant {self.name!r} at {self.frequency:g} Hz; "
+                f"dt={dt} s does not resolve the wing beat of plant {self.name!r} at {self.frequency:g} Hz; "
                 f"use dt <= {longest:g} s, {self.least_steps_per_beat} steps per beat."
             )
-        mode, remedy = "the body's velocity at full stroke", "a closure with less drag"
-        require_stable_step(self.name, self.dt, self.damping_rate(), mode=mode, remedy=remedy)
-
-    def damping_rate(self) -> float:
-        """Fastest decay rate [1/s] of the body's velocity over a beat at the largest stroke, from hover in calm air."""
-        t = torch.arange(100, dtype=torch.float64, device=self.mass.device) / (100 * self.frequency)
-        action = t.new_tensor([[self.actions[0].high, 0.0]]).expand(len(t), 2)
-
-        def acceleration(velocity: Tensor) -> Tensor:
-            return self.force(t, velocity, action, self.closure) / self.mass
-
-        at_rest = t.new_zeros(len(t), 2)
-        basis = torch.eye(2, dtype=t.dtype, device=t.device)
-        columns = [torch.func.jvp(acceleration, (at_rest,), (e.expand_as(at_rest),))[1] for e in basis]
-        return max(0.0, -torch.linalg.eigvals(torch.stack(columns, -1)).real.min().item())
 
     # The system
 

@@ -23,12 +23,10 @@ def gymnasium_pendulum(plant: Pendulum, *, seed: int = 0, device: torch.device |
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if Gymnasium is not installed, or cannot have the plant's gravity, time step or horizon.
+        ValueError: if Gymnasium's time step is not that of the plant.
     """
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise ValueError("the pendulum needs Gymnasium: install the extra, pip install 'rt_torchrl[gym]'.") from error
+    import gymnasium
+
     env = gymnasium.make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
     dt = vars(env.unwrapped)["dt"]
     if dt != plant.dt:

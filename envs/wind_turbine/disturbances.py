@@ -3,22 +3,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
-from rt_torchrl.options import require_range
-from rt_torchrl.plants.sampling import DisturbanceModel, require_request
+from rt_torchrl.options import Positive, Unbounded, configuration
+from rt_torchrl.plants.sampling import DisturbanceModel
 from rt_torchrl.plants.shapes import Draws
 
 CUT_IN_WIND = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""
-STORM = 120.0
-"""Wind speed above all that has been measured at the height of a rotor [m/s]."""
 
 
 @runtime_checkable
@@ -31,7 +30,7 @@ class WindModel(DisturbanceModel, Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class KaimalWind:
     r"""Hub-height longitudinal wind with the IEC Kaimal spectrum, made as TurbSim makes it.
 
@@ -58,15 +57,12 @@ class KaimalWind:
     Source: IEC 61400-1 annex B; Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198.
     """
 
-    mean: float = 11.0
-    intensity: float = 0.16
-    length_scale: float = 340.2
-    floor: float = CUT_IN_WIND
+    mean: Annotated[float, Field(gt=0, le=120)] = 11.0  # faster wind has not been measured at the height of a rotor
+    intensity: Annotated[float, Field(ge=0, le=1)] = 0.16
+    length_scale: Positive = 340.2
+    floor: Unbounded = CUT_IN_WIND
 
     def __post_init__(self) -> None:
-        require_range("mean", self.mean, 1e-3, STORM, unit="m/s", of="KaimalWind")
-        require_range("intensity", self.intensity, 0.0, 1.0, unit="-", of="KaimalWind")
-        require_range("length_scale", self.length_scale, 1.0, 1e4, unit="m", of="KaimalWind")
         if not self.floor < self.mean:
             raise ValueError(
                 f"floor={self.floor} m/s of KaimalWind must be below the mean wind {self.mean} m/s; "
@@ -93,9 +89,10 @@ class KaimalWind:
             generator: source of the phases.
 
         Raises:
-            ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
+            ValueError: if there are fewer samples.
         """
-        require_request(batch, n_steps, dt, least_steps=2)
+        if n_steps < 2:
+            raise ValueError(f"n_steps={n_steps} of KaimalWind must be at least 2; lengthen the episode or shorten dt.")
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         f = torch.arange(1, n_steps // 2 + 1, **like) / (n_steps * dt)
         phase = 2.0 * math.pi * torch.rand(batch, len(f), generator=generator, **like)
@@ -136,7 +133,6 @@ class RecordedWind:
             raise ValueError("records of RecordedWind is empty; pass at least one, for example from read_wind(path).")
         if not self.floor < math.inf:
             raise ValueError(f"floor={self.floor} m/s of RecordedWind must be a speed, or -math.inf for none.")
-        require_range("floor", self.floor, -math.inf, STORM, unit="m/s", of="RecordedWind")
 
     @property
     def mean(self) -> float:
@@ -153,9 +149,8 @@ class RecordedWind:
             generator: source of the choices of record and start.
 
         Raises:
-            ValueError: if an argument is out of its range, or a record is shorter than (n_steps − 1)·dt.
+            ValueError: if a record is shorter than (n_steps − 1)·dt.
         """
-        require_request(batch, n_steps, dt)
         needed = (n_steps - 1) * dt
         for record in self.records:
             # Rounding of k·dt must not reject a record that has exactly the needed length.

@@ -1,8 +1,7 @@
-"""Figures of the wind turbine: its set-points, its power coefficient, and the agreement of its twin."""
+"""Figures of the wind turbine: its set-points and its power coefficient."""
 
 from typing import Any, cast
 
-import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,7 +23,7 @@ RATIO_LABEL = r"tip-speed ratio $\lambda$ [-]"
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     """Every figure of the wind turbine, by name."""
-    return {figure.__name__: figure(snapshot) for figure in (power_and_speed, power_coefficient, scatter)}
+    return {figure.__name__: figure(snapshot) for figure in (power_and_speed, power_coefficient)}
 
 
 @torch.no_grad()
@@ -100,20 +99,4 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
     table.set_xlim(lams[0].item(), lams[-1].item())
     table.set_ylim(betas[0].item(), betas[-1].item())
     style.legend_below(figure, [table])
-    return figure
-
-
-def scatter(snapshot: Snapshot) -> Figure:
-    """Generator speed of the twin against the real one at the same instants (paper, fig. 12b)."""
-    real, twin = (array(WindTurbine.gear_ratio * s[:, 0]) for s in (snapshot.record.states, snapshot.replay))
-    error = twin - real
-    figure, ((ax,),) = style.panels(1, title="Twin against real generator speed", size=(5.4, 5.6))
-    ends = [min(real.min(), twin.min()), max(real.max(), twin.max())]
-    ax.plot(ends, ends, color=style.LIMITS, linewidth=1.2, label="perfect twin")
-    ax.plot(real, twin, "o", color=TWIN, markersize=3, alpha=0.5, label="sample")
-    ax.set_aspect("equal")
-    caption(ax, f"bias {error.mean():.2g} rad/s, RMS {np.sqrt(np.mean(error**2)):.2g} rad/s")
-    ax.set_xlabel(r"real $\omega_g$ [rad/s]")
-    ax.set_ylabel(r"twin $\omega_g$ [rad/s]")
-    ax.legend(loc="upper left", fontsize=9, frameon=False)
     return figure

@@ -36,19 +36,11 @@ STEP = 0.1
 
 @cache
 def rosco() -> ModuleType:
-    """ROSCO's toolbox with its modules.
+    """ROSCO's toolbox with its modules, which the extra ``rosco`` installs."""
+    import rosco
+    from rosco.toolbox import control_interface, controller, sim, turbine, utilities  # noqa: F401
+    from rosco.toolbox.inputs import validation  # noqa: F401
 
-    Raises:
-        ValueError: if the toolbox is not installed.
-    """
-    try:
-        import rosco
-        from rosco.toolbox import control_interface, controller, sim, turbine, utilities  # noqa: F401
-        from rosco.toolbox.inputs import validation  # noqa: F401
-    except ImportError as error:
-        raise ValueError(
-            "the real system of ROSCO needs its toolbox: install the extra, pip install 'rt_torchrl[rosco]'."
-        ) from error
     return rosco
 
 
@@ -149,11 +141,14 @@ def turbine_of(plant: Plant) -> WindTurbine:
     """The turbine itself.
 
     Raises:
-        ValueError: if the plant is no turbine, or has states that no sensor reads.
+        ValueError: if the plant is no turbine, has states that no sensor reads, or observes a preview of the wind.
     """
     turbine = plant.innermost
-    if not isinstance(turbine, WindTurbine) or plant.unread:
-        raise ValueError(f"plant {plant.name!r} must be a WindTurbine without hidden states: ROSCO simulates the rest.")
+    if not isinstance(turbine, WindTurbine) or plant.unread or plant.previews:
+        raise ValueError(
+            f"plant {plant.name!r} must be a WindTurbine without hidden states, which ROSCO simulates, and without "
+            "previews of the wind, because its simulator has no lidar; observe measured+wind."
+        )
     return turbine
 
 
@@ -199,14 +194,11 @@ def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if ROSCO is not installed, the plant's control interval does not fit, the plant has hidden states or
-            observes a preview of the wind.
+        ValueError: if the plant's control interval does not fit, or the plant is none that ROSCO simulates.
+        ImportError: if ROSCO is not installed.
     """
     turbine_of(plant)
     interval = steps_of(plant)
-    if plant.previews:
-        names = ", ".join(signal.name for signal in plant.inputs[len(plant.acting_inputs) :])
-        raise ValueError(f"ROSCO's simulator has no lidar, but the plant observes {names}; observe measured+wind.")
     rosco()
     machine = copy.deepcopy(plant).cpu()  # the simulator's side, wherever the twin's is
 

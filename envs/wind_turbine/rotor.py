@@ -187,25 +187,15 @@ def _checked(
     for name, axis in axes.items():
         if axis.ndim != 1 or len(axis) < 4 or not np.isfinite(axis).all() or (np.diff(axis) <= 0).any():
             raise ValueError(
-                f"{name}={axis.tolist()} must be at least 4 finite numbers that increase strictly, for a cubic spline; "
-                "sort it together with the values, drop duplicates and gaps, or add points."
+                f"{name}={axis.tolist()} must be at least 4 finite numbers that increase strictly, without duplicates."
             )
     lam, beta = axes.values()
     if lam[0] <= 0:
-        raise ValueError(
-            f"tip_speed_ratio starts at {lam[0]}; it must be positive, because the stall element covers λ from 0 "
-            "to the first row. Drop the rows with λ <= 0."
-        )
+        raise ValueError(f"tip_speed_ratio starts at {lam[0]}, but must be positive; drop the rows with λ <= 0.")
     cp = array_of("values", values)
-    if cp.shape != (len(lam), len(beta)):
-        hint = "; transpose it" if cp.shape == (len(beta), len(lam)) else ""
+    if cp.shape != (len(lam), len(beta)) or not (np.isfinite(cp) & (cp <= 16 / 27)).all():
         raise ValueError(
-            f"values has shape {cp.shape}, the axes ask for ({len(lam)}, {len(beta)}): a row per tip-speed ratio, a "
-            f"column per pitch angle{hint}."
-        )
-    if not (np.isfinite(cp) & (cp <= 16 / 27)).all():
-        raise ValueError(
-            f"values reaches {cp.max()}, but C_p must be finite and cannot exceed Betz's 16/27; if it is in per cent, "
-            "divide it by 100."
+            f"values of shape {cp.shape} up to {cp.max()} must be finite C_p, at most Betz's 16/27, not in per cent, "
+            f"a row per tip-speed ratio and a column per pitch angle, ({len(lam)}, {len(beta)})."
         )
     return lam, beta, cp

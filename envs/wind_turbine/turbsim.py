@@ -87,7 +87,8 @@ def read_wind(path: str | os.PathLike[str]) -> WindRecord:
         path: path of a ``.hh`` file, see :func:`read_hh`, or of a ``.bts`` file, see :func:`read_bts`.
 
     Raises:
-        ValueError: if the suffix is another one, or the file does not exist or is malformed.
+        ValueError: if the suffix is another one, or the file is malformed.
+        OSError: if the file cannot be read.
     """
     readers = {".hh": read_hh, ".bts": read_bts}
     suffix = Path(path).suffix.lower()
@@ -96,8 +97,6 @@ def read_wind(path: str | os.PathLike[str]) -> WindRecord:
             f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' "
             "(WrADHH; under another name by read_hh) or binary full field '.bts' (WrADFF)."
         )
-    if not Path(path).is_file():
-        raise ValueError(f"{path} is no file; give the path of TurbSim output.")
     return readers[suffix](path)
 
 
@@ -146,7 +145,7 @@ HEADER = np.dtype(
     + [("n_description", "<i4")]
 )
 """The fixed part of a ``.bts`` file, in the order in which it is written."""
-AGAIN = "Copy the file again, in binary mode, or run TurbSim again."
+AGAIN = "Copy the file again, in binary mode, or run TurbSim with WrADFF again."
 
 
 def read_bts(path: str | os.PathLike[str]) -> WindRecord:
@@ -165,31 +164,22 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     """
     size = os.path.getsize(path)
     if size < HEADER.itemsize:
-        raise ValueError(
-            f"{path}: is truncated, it holds {size} bytes, but the header alone takes {HEADER.itemsize} bytes. {AGAIN}"
-        )
+        raise ValueError(f"{path}: holds {size} bytes, but the header alone takes {HEADER.itemsize} bytes. {AGAIN}")
     record = np.fromfile(path, HEADER, 1)[0]
     header = SimpleNamespace(**{name: record[name].item() for name in record.dtype.names})
-    if header.identifier not in (7, 8):
-        raise ValueError(
-            f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "
-            "(periodic). Is it another format, such as Bladed's .wnd? Run TurbSim with WrADFF."
-        )
     counts_right = min(header.n_z, header.n_y, header.n_t) >= 1 and min(header.n_tower, header.n_description) >= 0
-    scales = (header.dz, header.dy, header.dt, header.u_slope)
-    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in vars(header).values())):
+    scales_right = min(header.dz, header.dy, header.dt, header.u_slope) > 0
+    finite = all(math.isfinite(value) for value in vars(header).values())
+    if not (header.identifier in (7, 8) and counts_right and scales_right and finite):
         raise ValueError(
-            f"{path}: header is corrupt, {header}; counts and spacings must be positive and all values finite. {AGAIN}"
+            f"{path}: is no TurbSim full field, or is corrupt: its header is {header}, but the identifier must be 7 or "
+            f"8, counts and spacings positive, all values finite. {AGAIN}"
         )
     start = HEADER.itemsize + header.n_description
     shape = (header.n_t, header.n_z * header.n_y + header.n_tower, 3)
     expected = start + 2 * math.prod(shape)
     if size != expected:
-        raise ValueError(
-            f"{path}: is {'truncated' if size < expected else 'too long'}, it holds {size} bytes, but its header "
-            f"({header.n_t} steps of {header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies "
-            f"{expected} bytes. {AGAIN}"
-        )
+        raise ValueError(f"{path}: holds {size} bytes, but its header implies {expected} bytes: {header}. {AGAIN}")
     # The field is mapped and not read, because it has hundreds of megabytes, of which the hub needs four columns. The
     # reader of openfast_toolbox and weio allocates what the header declares, in double precision, and checks no length.
     raw = np.memmap(path, dtype="<i2", mode="r", offset=start, shape=shape)

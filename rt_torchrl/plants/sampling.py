@@ -100,26 +100,6 @@ class DisturbanceModel(Protocol):
         """The input in ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt, in the unit of its signal."""
 
 
-def require_request(batch: int, n_steps: int, dt: float, *, least_steps: int = 1) -> None:
-    """Refuse a draw of no episodes, of too few samples, or at a sampling interval that is not positive and finite.
-
-    Args:
-        batch: number of episodes.
-        n_steps: number of samples of each episode.
-        dt: sampling interval [s].
-        least_steps: least number of samples that the model can draw.
-
-    Raises:
-        ValueError: if an argument is out of its range; the message names it.
-    """
-    if batch < 1:
-        raise ValueError(f"batch={batch} must be at least 1.")
-    if n_steps < least_steps:
-        raise ValueError(f"n_steps={n_steps} must be at least {least_steps}; lengthen the episode or shorten dt.")
-    if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt={dt} s must be positive and finite.")
-
-
 def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:
     """The mean of the values at both ends of every interval."""
     return 0.5 * (values[1:] + values[:-1])
