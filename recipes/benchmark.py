@@ -23,13 +23,9 @@ from rt_torchrl.options import AtLeastOne, File, Positive
 from rt_torchrl.trajectories.rollout import refusal
 
 PlantName = Literal["flapping_wing", "wind_turbine", "cryogenic_tank"]
-Policy = Literal["affine", "mlp"]
 QUANTITIES = ("forward", "gradient")
 TURN = 0.1
 """Least time [s] that the calls of a turn take together."""
-STEPS_OF: dict[PlantName, float] = {"cryogenic_tank": 4.32}
-"""Control intervals that differ from the plants' own [s]: with 30 s the tank would run empty within 1e5 intervals."""
-HIDDEN = (32, 32)
 COLOURS = {"native": "#D55E00", "parallel": "#0072B2", "odeint_adjoint": "#009E73", "autograd": "#222222"}
 
 
@@ -38,8 +34,7 @@ class Config:
     """Time J_a and its gradient by the policy's weights by the gradient engines.
 
     Args:
-        plants: plants, with their own closures.
-        policy: affine for the plant's own policy, mlp for a perceptron of 32 x 32; its weights are random.
+        plants: plants, with their own closures, and their own policies with random weights.
         horizons: numbers of control intervals.
         realisations: numbers of trajectories N_z; each is timed with each horizon.
         engines: gradient engines; ratios are over the first one. An engine that cannot roll a plant out is left out.
@@ -51,7 +46,6 @@ class Config:
     """
 
     plants: tuple[PlantName, ...] = get_args(PlantName)
-    policy: Policy = "affine"
     horizons: tuple[AtLeastOne, ...] = (100, 1_000, 10_000)
     realisations: tuple[AtLeastOne, ...] = (5, 25)
     engines: tuple[rt.Engine, ...] = get_args(rt.Engine)
@@ -59,12 +53,6 @@ class Config:
     repeats: AtLeastOne = 5
     limit: Positive = 2.0
     output: File | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("plants", "horizons", "realisations", "engines"):
-            values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise ValueError(f"{name}={values} must be one value or several different ones.")
 
 
 class System(NamedTuple):
@@ -88,8 +76,8 @@ Contender = Callable[[rt.Scenario], Calls]
 class Row(NamedTuple):
     """The median times [s] of one contender at one size.
 
-    ``ratio`` is that of the gradient over the first contender's, ``first`` the wall time of the first gradient of this
-    size, which may compile, and ``gap`` the relative difference of the gradient from that of the first contender.
+    ``ratio`` is that of the gradient over the first contender's, and ``gap`` the relative difference of the gradient
+    from that of the first contender.
     """
 
     plant: str
@@ -99,25 +87,20 @@ class Row(NamedTuple):
     forward: float
     gradient: float
     ratio: float
-    first: float
     gap: float
 
 
 def plant_of(name: PlantName, steps: int = 100) -> rt.Plant:
     """A plant, with episodes of this many control intervals."""
     kind = rt.shipped_plants()[name]
-    dt = STEPS_OF.get(name) or kind().dt
-    return kind(dt=dt, horizon=steps * dt)
+    return kind(horizon=steps * kind().dt)
 
 
-def system_of(name: PlantName, policy: Policy) -> System:
+def system_of(name: PlantName) -> System:
     """The plant of a name with its closure and a policy."""
     plant, generator = plant_of(name), torch.Generator().manual_seed(0)
     closure = plant.make_closure(generator).requires_grad_(False)
-    if policy == "affine":
-        return System(plant, closure, plant.make_policy(generator))
-    network = rt.SaturatedMLP(len(plant.observations), plant.actions, hidden=HIDDEN, generator=generator)
-    return System(plant, closure, network)
+    return System(plant, closure, plant.make_policy(generator))
 
 
 def engine_of(engine: rt.Engine, system: System) -> Contender:
@@ -140,7 +123,7 @@ def engine_of(engine: rt.Engine, system: System) -> Contender:
 
 def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[System], Contender]]) -> list[Row]:
     """The times of all contenders on one plant, the smaller sizes first; each is printed at once."""
-    system, rows = system_of(name, config.policy), list[Row]()
+    system, rows = system_of(name), list[Row]()
     engines = [engine for engine in config.engines if refusal(engine, system.plant) is None]
     contenders = {engine: engine_of(engine, system) for engine in engines}
     contenders |= {peer: make(system) for peer, make in peers.items()}
@@ -152,11 +135,7 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
             for contender, make in contenders.items()
             if predicted(rows, contender, steps, batch) <= config.limit
         }
-        gradients, first = dict[str, Tensor](), dict[str, float]()
-        for contender, call in calls.items():
-            start = time.perf_counter()
-            gradients[contender] = call.gradient()
-            first[contender] = time.perf_counter() - start
+        gradients = {contender: call.gradient() for contender, call in calls.items()}
         forward, gradient = (
             medians({who: getattr(call, quantity) for who, call in calls.items()}, config) for quantity in QUANTITIES
         )
@@ -164,7 +143,7 @@ def rows_of(config: Config, name: PlantName, peers: Mapping[str, Callable[[Syste
             best = next(iter(calls))
             ratio = gradient[who] / gradient[best]
             gap = ((gradients[who] - gradients[best]).norm() / gradients[best].norm()).item()
-            rows.append(Row(name, steps, batch, who, forward[who], gradient[who], ratio, first[who], gap))
+            rows.append(Row(name, steps, batch, who, forward[who], gradient[who], ratio, gap))
             print(line(rows[-1]), flush=True)
     return rows
 
@@ -190,7 +169,7 @@ def medians(functions: Mapping[str, Callable[[], Any]], config: Config) -> dict[
 def line(row: Row) -> str:
     """A line of the table."""
     size = f"{row.plant:<15}{row.steps:>9}{row.realisations:>6}  {row.contender:<15}"
-    times = f"{1e3 * row.forward:>11.3f}{1e3 * row.gradient:>10.3f}{row.ratio:>9.1f}{row.first:>9.2f}"
+    times = f"{1e3 * row.forward:>11.3f}{1e3 * row.gradient:>10.3f}{row.ratio:>9.1f}"
     return f"{size}{times}{row.gap:>9.1e}"
 
 
@@ -202,7 +181,7 @@ def save(rows: Sequence[Row], config: Config, folder: Path) -> None:
     write_json(folder / "benchmark.json", content)
     batch = config.realisations[0]
     for plant in config.plants:
-        title = f"{plant}, {config.policy} policy, threads: {config.threads}"
+        title = f"{plant}, threads: {config.threads}"
         figure, axes = panels(1, 2, title=title, size=(10.5, 4.0), sharey="row")
         for ax, quantity in zip(axes[0], QUANTITIES, strict=True):
             timed = [row for row in rows if (row.plant, row.realisations) == (plant, batch)]
@@ -229,7 +208,7 @@ def main(config: Config, peers: Mapping[str, Callable[[System], Contender]] | No
     torch.set_num_threads(config.threads)
     clock = "CPU" if config.threads == 1 else "wall"
     head = f"{'plant':<15}{'intervals':>9}{'N_z':>6}  {'engine':<15}{clock + ' ms':>11}{'gradient':>10}"
-    print(f"{head}{'ratio':>9}{'first s':>9}{'gap':>9}", flush=True)
+    print(f"{head}{'ratio':>9}{'gap':>9}", flush=True)
     rows = [row for name in config.plants for row in rows_of(config, name, peers or {})]
     if config.output is not None:
         save(rows, config, config.output)

@@ -100,15 +100,9 @@ class Config(rt.RunConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        CryogenicTank.chosen(self.observe)
-        self.cost()
-        unknown.changes(self.unknown)  # which refuses what does not go together
         planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"
-        if planned and self.command != "duty":
-            raise ValueError(
-                f"command={self.command!r} does not go with start='mpc' or method='receding_horizon': gradients find "
-                "no plans of a half-open valve, whose cost has many minima. Use command duty."
-            )
+        if planned and self.command == "drop":
+            raise ValueError("command='drop' goes with no predictive control, whose plans it leads astray; use duty.")
 
     def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         return super().presets() | {
@@ -129,14 +123,10 @@ class Config(rt.RunConfig):
         return CryogenicTank(
             horizon=self.horizon,
             fluid=self.fluid,
-            cost=self.cost(),
+            cost=PressureCost(vented=self.vented_weight, end=self.end_weight),
             command=self.command,
             observe=self.observe,
         )
-
-    def cost(self) -> PressureCost:
-        """The cost that the options ask for."""
-        return PressureCost(vented=self.vented_weight, end=self.end_weight)
 
     def plant_figures(self, snapshot):
         from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib

@@ -107,11 +107,6 @@ class Config(rt.RunConfig):
     unseen: int = 100
     twinning: rt.TwinningConfig = DEFAULT
 
-    def __post_init__(self):
-        super().__post_init__()
-        FlappingWing.chosen(self.observe)
-        unknown.changes(self.unknown)  # which refuses what does not go together
-
     def presets(self) -> dict[rt.Preset, dict[str, Any]]:
         return super().presets() | {
             "default": {"twinning": HOP if self.task == "hop" else DEFAULT},

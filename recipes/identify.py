@@ -75,13 +75,10 @@ class Config:
         make = plant_class(self.plant)
         try:
             plant = make()
-            if self.dt is None:
-                return plant
-            return make(dt=self.dt, horizon=max(1, round(plant.horizon / self.dt)) * self.dt)
+            return plant if self.dt is None else make(dt=self.dt, horizon=round(plant.horizon / self.dt) * self.dt)
         except TypeError as error:
             raise ValueError(
-                f"plant={self.plant!r} cannot be made ({error}): its options must have defaults, and for --dt it needs "
-                "dt and horizon. A class of your own that derives from it can fill them in."
+                f"plant={self.plant!r} cannot be made ({error}): arguments need defaults, and --dt needs dt and horizon."
             ) from error
 
     def guesses(self) -> dict[str, float]:
@@ -133,9 +130,6 @@ def main(config: Config) -> None:
     identified = identify(task, *records)
     described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
     metrics = {"plant": plant.name} | metrics_of(identified) | {"log": described, "config": dataclasses.asdict(config)}
-    for side, segments in zip(("training", "held_out"), split, strict=True):
-        metrics[side]["seconds"] = plant.dt * sum(len(segment.actions) for segment in segments)
-    metrics["held_back"] = held_back(plant, parts.segments)
     write_json(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     figures = {
@@ -176,19 +170,6 @@ def metrics_of(identified: Identified) -> dict[str, Any]:
     return finite(summary | {"warnings": estimate.warnings()})
 
 
-def held_back(plant: rt.Plant, segments: list[rt.Trajectory]) -> dict[str, float]:
-    """Share of the control intervals in which the plant's actuators would not have applied the logged action.
-
-    In these intervals the action that the actuators allow drives the twin. They are a sign of wrong rate limits, units
-    or columns.
-    """
-    held = []
-    for segment in segments:
-        allowed = plant.actuate(segment.states[:-1], segment.actions)
-        held.append((allowed - segment.actions).abs() > 1e-6 * segment.actions.abs().amax(0).clamp_min(1e-12))
-    return dict(zip((a.name for a in plant.actions), torch.cat(held).double().mean(0).tolist(), strict=True))
-
-
 def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) -> str:
     """The parts and gaps of the log, for the terminal."""
     steps = [len(segment.actions) for segment in parts.segments]
@@ -196,11 +177,7 @@ def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) 
         f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
         f"{plant.dt:g} s in {len(steps)} segments"
     ]
-    lines += [
-        f"  gap from {first:g} to {last:g} s "
-        + (f"(limit {parts.gap:g} s)" if last - first > parts.gap * (1.0 + resampling.ROUNDING) else "of rows left out")
-        for first, last in parts.gaps
-    ]
+    lines += [f"  gap from {first:g} to {last:g} s" for first, last in parts.gaps]
     lines += [f"  left out as too short: {first:g} to {last:g} s" for first, last in parts.too_short]
     return "\n".join(lines)
 
@@ -217,13 +194,7 @@ def table(metrics: dict[str, Any]) -> str:
     frame = pandas().DataFrame
     blocks = [frame(of_sensors).T, frame(errors), frame(weights).T]
     texts = [block.astype(float).to_string(float_format="{:.5g}".format, na_rep="unknown") for block in blocks]
-    notes = [f"note: {warning}" for warning in metrics["warnings"]]
-    notes += [
-        f"the plant's actuators hold back {name} in {share:.1%} of the log"
-        for name, share in metrics["held_back"].items()
-        if share
-    ]
-    return "\n\n".join([*texts, "\n".join(notes)])
+    return "\n\n".join([*texts, "\n".join(f"note: {warning}" for warning in metrics["warnings"])])
 
 
 if __name__ == "__main__":

@@ -111,15 +111,13 @@ def learning(plant: str, metrics: list[dict[str, Any]]) -> Figure:
 def robustness(plant: str, metrics: list[dict[str, Any]]) -> Figure:
     """Figures 15, 19 and 25: costs of both policies and of the twin on unseen episodes, of all seeds."""
     unseen = [run["summary"]["unseen"] for run in metrics]
-    figure, axes = panels(1, 2, title=f"{plant}: unseen episodes of {len(unseen)} seeds", size=(9.0, 4.5))
-    violins = {role_name(role): [c for run in unseen for c in run["costs"][role] if c is not None] for role in POLICIES}
-    for ax, costs, label in (
-        (axes[0, 0], violins, "J_a on the real system"),
-        (axes[0, 1], {"twin": [c for run in unseen for c in run["J_p_each"] if c is not None]}, "J_p"),
-    ):
-        values = [np.log10(np.maximum(sample, 1e-300)) for sample in costs.values()]
-        ax.violinplot(values, showmedians=True)
-        ax.set_xticks(range(1, len(costs) + 1), list(costs))
+    samples = {f"J_a, {role_name(role)}": [cost for run in unseen for cost in run["costs"][role]] for role in POLICIES}
+    samples["J_p"] = [cost for run in unseen for cost in run["J_p_each"]]
+    figure, axes = panels(1, 3, title=f"{plant}: unseen episodes of {len(unseen)} seeds", size=(9.0, 4.5))
+    for ax, (label, sample) in zip(axes.flat, samples.items(), strict=True):
+        finite = [cost for cost in sample if cost is not None]
+        ax.violinplot(np.log10(np.maximum(finite, 1e-300)), showmedians=True)
+        ax.set_xticks([])
         caption(ax, f"log10 of {label}")
     return figure
 

@@ -70,7 +70,7 @@ def main(config: Config) -> None:
     generator = torch.Generator().manual_seed(config.seed)
     controller = CONTROLLERS.get(plant.name)
     law = controller(plant).act if controller else policy_law(plant, plant.make_policy(generator))
-    log = recorded(plant, law, generator, jitter=0.0 if plant.own_scheme else JITTER, noise=config.noise)
+    log = recorded(plant, law, generator, jitter=JITTER, noise=config.noise)
     share = log.times / log.times[-1]
     log = log.chosen((share <= 0.5) | (share > 0.5 + config.gap))
     log = log.without([s.name for s in logged_states(plant) if config.states and s.name not in config.states])
@@ -94,7 +94,7 @@ def recorded(
     At t_j the loop observes and acts. Action and exogenous input are held until t_{j+1}, and one step integrates the
     plant over that interval. The loop acts on the true state; the log holds the state with the sensors' noise.
 
-    A plant with a scheme of its own can only step by Δt, and so must be recorded without jitter.
+    A plant with a scheme of its own can only step by Δt, and so is recorded without jitter.
 
     Args:
         plant: plant whose own closure is the true one.
@@ -102,17 +102,12 @@ def recorded(
         generator: source of initial state, exogenous input, jitter and noise, in this order.
         jitter: greatest difference between an interval and dt, as a share of dt; it lies in [0, 1).
         noise: standard deviation of the sensors of the states, as a share of the value that they read.
-
-    Raises:
-        ValueError: if there is jitter and the plant has a scheme of its own.
     """
-    if jitter and plant.own_scheme:
-        raise ValueError(
-            f"jitter={jitter}: plant {plant.name!r} steps by a scheme of its own; record it with jitter=0."
-        )
     n, n_s = plant.n_steps, len(plant.states)
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64) - 0.5)
+    offsets = (0.0 if plant.own_scheme else jitter) * (
+        torch.rand(n + 1, generator=generator, dtype=torch.float64) - 0.5
+    )
     offsets[0] = 0.0
     times, rows = plant.dt * (torch.arange(n + 1) + offsets), []
     for k in range(n + 1):

@@ -183,11 +183,7 @@ def main(config: Config, **parts: Any) -> None:
     if config.serve:
         print(f"the turbine is served over {config.protocol} on port {config.port}; Ctrl-C ends it", flush=True)
         logging.disable(logging.CRITICAL)  # clients that go away are no errors of this process
-        try:
-            asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
-        except (OSError, RuntimeError) as error:  # pymodbus raises a RuntimeError if it cannot listen
-            raise ValueError(f"port={config.port} cannot be listened on: {error}") from error
-
+        asyncio.run(serve(ServedPlant(plant, SAFE, seed=config.seed), *place))
     config = dataclasses.replace(config, asynchronous=True, operation=rt.OperationConfig(continuous=True))
     env = partial(machine, plant, SAFE, *place)
     rt.Run(config, plant, env=env, first=JonkmanController, **parts).train()

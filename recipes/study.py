@@ -10,11 +10,10 @@ import re
 import shlex
 import statistics
 import traceback
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import rt_torchrl as rt
 
@@ -22,6 +21,7 @@ if __name__ == "__main__":
     rt.begin_loading()
 
 import torch
+from pydantic import Field
 
 from rt_torchrl.atomic_file import make_folder, read_json, write_atomically, write_json
 from rt_torchrl.evaluation.optimum import exact_optimum
@@ -69,7 +69,7 @@ class Config:
     """
 
     systems: tuple[str, ...] = ()
-    arms: tuple[str, ...] = ARMS
+    arms: Annotated[tuple[str, ...], Field(min_length=1)] = ARMS
     seeds: AtLeastOne = 5
     given: str = ""
     optimum: bool = True
@@ -78,10 +78,6 @@ class Config:
     quick: bool = False
     runs: tuple[Path, ...] = ()
     log_dir: Path = Path("runs/study")
-
-    def __post_init__(self):
-        if not self.arms:
-            raise ValueError("arms names none; give options, or twinning, model_based or model_free.")
 
     def systems_by_name(self) -> dict[str, tuple[Path, list[str]]]:
         """Recipe and options of each system."""
@@ -122,7 +118,9 @@ class Config:
                     Training(recipe, words, seed, folder / f"seed-{seed}")
                     for seed in range(min(self.seeds, 2) if self.quick else self.seeds)
                 ]
-                trainings[system, arm][0].config()  # a mistake ends it here and not in every training
+                config = trainings[system, arm][0].config()  # a mistake ends it here and not in every training
+                if isinstance(config, MakesPlant):
+                    config.plant()
         return trainings
 
     def search(self, training: "Training") -> "Search":
@@ -263,8 +261,6 @@ class Search:
         """Compute the cost, unless it is kept."""
         if self.finished():
             return
-        if self.path.exists():
-            warnings.warn(f"{self.path} is damaged; it is computed again.", stacklevel=2)
         torch.set_num_threads(1)
         config = options_of(self.recipe, self.words).effective()
         plant, physics = plant_of(config), physics_of(config)
@@ -315,13 +311,15 @@ def run_all(tasks: Sequence[Training | Search], *, jobs: int = 0, backend: str =
         What went wrong.
 
     Raises:
-        ValueError: before any work, if a folder holds a run of other options, or Ray is missing.
+        ValueError: before any work, if a folder holds a run of other options.
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
     """
     from joblib import Parallel, delayed  # here, because --help needs none of it
     from tqdm import tqdm
 
     if backend == "ray":
+        from ray.util.joblib import register_ray  # of the extra cluster
+
         register_ray()
     missing, failures = [task for task in tasks if not task.finished()], []
     if not missing:
@@ -342,19 +340,6 @@ def run_all(tasks: Sequence[Training | Search], *, jobs: int = 0, backend: str =
             bar.write(f"interrupted: {bar.n} of {len(tasks)} are finished; the same command goes on")
             raise
     return failures
-
-
-def register_ray() -> None:
-    """Make Ray a backend of joblib.
-
-    Raises:
-        ValueError: if Ray is missing.
-    """
-    try:
-        from ray.util.joblib import register_ray as register
-    except ImportError as error:
-        raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[cluster]'.") from error
-    register()
 
 
 def overview(comparisons: Sequence[rt.Comparison], key: str) -> str:

@@ -99,8 +99,6 @@ class Config(rt.RunConfig):
         super().__post_init__()
         if self.task == "paper" and self.engineering != EngineeringCost():
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
-        WindTurbine.chosen(self.observe)
-        unknown.changes(self.unknown)  # which refuses what does not go together
         if self.unknown and self.real == "rosco":
             raise ValueError(f"unknown={self.unknown} does not go with real='rosco', another real system; give one.")
 

@@ -17,7 +17,7 @@ def rows(folder, script, *options):
     done = fresh_process.run(script, "--output", str(folder), "--repeats", "1", *options)
     assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads((folder / "benchmark.json").read_text())["rows"]
-    assert all(row["forward"] > 0.0 and row["gradient"] > 0.0 and row["first"] > 0.0 for row in found)
+    assert all(row["forward"] > 0.0 and row["gradient"] > 0.0 for row in found)
     return {(row["contender"], row["steps"]): row for row in found}, done.stdout
 
 
@@ -53,14 +53,13 @@ def test_engines_agree_over_a_whole_episode(tmp_path, plant, steps):
 
 
 @pytest.mark.nightly  # half a minute of g++
-@pytest.mark.parametrize("policy", ["affine", "mlp"])
-def test_jax_and_casadi_have_the_same_gradients(tmp_path, policy):
+def test_jax_and_casadi_have_the_same_gradients(tmp_path):
     """Their equations are written by hand; three realisations fill no vector."""
     for package in ("jax", "casadi"):
         pytest.importorskip(package, reason="JAX and CasADi come with the group nightly")
     if shutil.which("g++") is None:
         pytest.skip("CasADi's code needs g++")
-    sizes = ["--plants", "flapping_wing", "--policy", policy, "--horizons", "60", "--realisations", "3"]
+    sizes = ["--plants", "flapping_wing", "--horizons", "60", "--realisations", "3"]
     found, printed = rows(tmp_path, PEERS, *sizes, "--engines", "autograd", "native")
     assert {name for name, _ in found} == {"autograd", "native", "jax", "casadi", "casadi_lanes"}
     assert all(row["gap"] < 1e-10 for row in found.values()) and "casadi_lanes" in printed

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_plants import Line, flown, line_segment
+from small_plants import Line, line_segment
 from test_export_recipe import recipe
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of, with_biases
@@ -50,19 +49,6 @@ def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise()
         assert (after.rms < 0.1 * before.rms).all() and (after.rms < 0.01).all()
     # Interpolation between two noisy samples shares them: about a quarter, here within ±0.25.
     assert (found.autocorrelation < 0.5).all() and (found.autocorrelation > 0.0).all()
-
-
-def test_actions_that_the_actuators_would_not_apply_are_told():
-    held_back, plant = recipe("identify").held_back, WindTurbine(horizon=20.0)
-    (segment,) = flown(plant, torch.Generator().manual_seed(0), (40,))
-    assert held_back(plant, [segment]) == {"generator_torque": 0.0, "blade_pitch": 0.0}
-    states, actions, exogenous, *_ = segment
-    jump = actions.clone()
-    jump[20:, 1] += 10.0
-    # The states remember what was applied before: the pitch may move by 4 deg, and only at step 20 it moved by more;
-    # later the remembered pitch is 10 deg behind in every interval.
-    share = held_back(plant, [Trajectory(states, jump, exogenous)])
-    assert share["generator_torque"] == 0.0 and share["blade_pitch"] == pytest.approx(0.5, abs=0.13)
 
 
 class Joints(PositiveCoefficients):
