@@ -78,7 +78,7 @@ class Config:
             return plant if self.dt is None else make(dt=self.dt, horizon=round(plant.horizon / self.dt) * self.dt)
         except TypeError as error:
             raise ValueError(
-                f"plant={self.plant!r} cannot be made ({error}): arguments need defaults, and --dt needs dt and horizon."
+                f"plant={self.plant!r} cannot be made ({error}): arguments need defaults, and --dt needs a horizon."
             ) from error
 
     def guesses(self) -> dict[str, float]:
