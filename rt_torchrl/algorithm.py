@@ -250,7 +250,7 @@ class ReinforcementTwinning(TensorDictSequential):
             self.assimilation.explain(self.belief.replayed(records, counted), self.generator)
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)
-        report = imitation.begin(self.first.teacher, imitating, flown, on_twin=on_twin)
+        report = imitation.begin(self.first.teacher, imitating, flown)
         if counted != self.twin.plant.n_steps:  # later records are those of whole episodes
             self.short_term.clear()
             self.virtual.processes.clear()

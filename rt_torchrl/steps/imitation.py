@@ -77,8 +77,7 @@ class Imitation:
             feedback has no weights that could imitate, so that a clone of it is refused.
         """
         if isinstance(idle, StateFeedback):
-            reason = f"no clone: {type(idle).__name__} plans its actions and cannot imitate a policy"
-            return metrics(reason).set_non_tensor("event", "keep")
+            return metrics(f"no clone: {type(idle).__name__} plans its actions and imitates nobody", event="keep")
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())
             return metrics()
@@ -91,18 +90,17 @@ class Imitation:
             return metrics(**entries)
         idle.load_state_dict(before)
         costs = f"it is expected to cost {clone.expected:.4g}, and what it replaces {replaced.expected:.4g}"
-        return metrics(f"clone refused: {costs}", **entries).set_non_tensor("event", "keep")
+        return metrics(f"clone refused: {costs}", **entries, event="keep")
 
-    def begin(
-        self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, *, on_twin: bool
-    ) -> TensorDict:
+    def begin(self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory) -> TensorDict:
         """Make the policies imitate a controller; one that would fare worse on the twin than before stays as it was.
+
+        Where a twin is trained, they also learn from virtual episodes, and are judged in them.
 
         Args:
             teacher: the controller, a policy or :class:`StateFeedback`; None if only the records show its actions.
             policies: the policies by role; state feedback among them is left alone.
             records: real episodes that the controller has flown.
-            on_twin: whether policies also learn from virtual episodes and are judged in them.
 
         Returns:
             ``start_error_`` of each role, the RMS difference of the actions as a share of their ranges, and on the twin
@@ -112,7 +110,7 @@ class Imitation:
         starts = {role: copy.deepcopy(policy) for role, policy in pupils.items()}
         # Every virtual episode of model predictive control takes as long as its solves.
         count = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else self.count
-        judged_on = self.virtual.draw(count) if on_twin else None
+        judged_on = self.virtual.draw(count) if self.virtual.processes else None
         report = metrics()
         for role, policy in pupils.items():
             first = next(other for other, start in starts.items() if clones(start, starts[role]))

@@ -1,7 +1,7 @@
 """What a training begins with instead of random weights: a controller, a recorded log, or an earlier training."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -20,31 +20,34 @@ Fly = Callable[[nn.Module], Flight]
 """Function that lets a policy or state feedback fly one episode on the real system, without exploration."""
 
 
-@runtime_checkable
-class Start(Protocol):
-    """What a training begins with instead of random weights; the algorithm asks in the order of the methods."""
+class Start:
+    """What a training begins with instead of random weights; the algorithm asks in the order of the methods.
 
-    @property
-    def live(self) -> Role:
-        """Role that acts in the first episode, where both policies are trained."""
+    Attributes:
+        live: role that acts in the first episode, where both policies are trained.
+        teacher: policy or state feedback that policies imitate; None where only the flights show what it did.
+    """
 
-    @property
-    def teacher(self) -> nn.Module | None:
-        """Policy or state feedback that policies imitate; None where only the flights show what it did."""
+    live: Role = "model_based"
+    teacher: nn.Module | None = None
 
     def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:
-        """Load the weights that are known into policies and closure, in place.
+        """Load the weights that are known into policies and closure, in place; by default none are.
 
         Returns:
             The roles of the policies whose weights are not known: they imitate.
         """
+        return list(policies)
 
     def flights(self, fly: Fly) -> list[Flight]:
         """Episodes of the real system, oldest first and of equal length, from which twin and policies learn.
 
         Args:
-            fly: function that flies one on the real system; nothing is flown if enough is known without it.
+            fly: function that flies one on the real system, by default the teacher; nothing is flown if enough is known
+                without it.
         """
+        assert self.teacher is not None
+        return [fly(self.teacher)]
 
 
 def first_live(arm: Arm, first: Start | None) -> Role:
@@ -54,28 +57,20 @@ def first_live(arm: Arm, first: Start | None) -> Role:
     return "model_free" if first is None else first.live
 
 
-class FirstController:
-    """A controller flies one episode before all others, and policies imitate it; see :class:`Start` for the members.
+class FirstController(Start):
+    """A controller flies one episode before all others, and policies imitate it.
 
     Args:
         controller: the controller, as :class:`StateFeedback`, such as a :class:`ClassicalController`,
             or :class:`PredictiveControl` on the closure of the twin.
     """
 
-    live: Role = "model_based"
-
     def __init__(self, controller: nn.Module):
         self.teacher = controller
 
-    def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:
-        return list(policies)
 
-    def flights(self, fly: Fly) -> list[Flight]:
-        return [fly(self.teacher)]
-
-
-class EarlierPolicies:
-    """Policies and twin of an earlier training begin a new one; see :class:`Start` for the members.
+class EarlierPolicies(Start):
+    """Policies and twin of an earlier training begin a new one.
 
     The weights of a policy of the same architecture are taken as they are: those of its own role, or else those of the
     policy that was live. Where a policy has another architecture, the live one flies one episode, and
@@ -96,6 +91,7 @@ class EarlierPolicies:
         hypotheses: Mapping[str, Any] | None = None,
     ):
         self.policies, self.closure, self.live, self.hypotheses = policies, closure, live, hypotheses
+        self.teacher: nn.Module = policies[live]
 
     def hand_over(self, twin: DigitalTwin) -> None:
         """Give the new training's twin the hypotheses, if both have some, before the algorithm takes it.
@@ -105,11 +101,6 @@ class EarlierPolicies:
         """
         if self.hypotheses is not None and isinstance(twin, TwinEnsemble):
             twin.load_hypotheses(self.hypotheses)
-
-    @property
-    def teacher(self) -> nn.Module:
-        """The policy that was live."""
-        return self.policies[self.live]
 
     def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:
         """See :meth:`Start.take`.
@@ -128,9 +119,6 @@ class EarlierPolicies:
                 pupils.append(role)
         return pupils
 
-    def flights(self, fly: Fly) -> list[Flight]:
-        return [fly(self.teacher)]
-
 
 def takes(policy: nn.Module, earlier: nn.Module) -> bool:
     """Whether a policy takes the weights of an earlier one as they are."""
@@ -139,22 +127,16 @@ def takes(policy: nn.Module, earlier: nn.Module) -> bool:
     return same_architecture(policy, earlier)
 
 
-class RecordedFlights:
-    """Records of the real system under any controller: policies imitate its actions; see :class:`Start`.
+class RecordedFlights(Start):
+    """Records of the real system under any controller: policies imitate its actions.
 
     Args:
         plant: plant of the records.
         records: records of equal length, oldest first; at least one.
     """
 
-    live: Role = "model_based"
-    teacher: nn.Module | None = None
-
     def __init__(self, plant: Plant, records: Sequence[Trajectory]):
         self.plant, self.records = plant, records
-
-    def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:
-        return list(policies)
 
     def flights(self, fly: Fly) -> list[Flight]:
         flown = [(transitions_of(self.plant, record), record) for record in self.records]
