@@ -33,7 +33,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
+from torch.utils._pytree import tree_map_only
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
@@ -48,7 +49,7 @@ from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, Operate, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
-from rt_torchrl.steps.report import EpisodeReport, merged, metrics, on_device
+from rt_torchrl.steps.report import EpisodeReport, merged, metrics
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
@@ -306,7 +307,8 @@ class ReinforcementTwinning(TensorDictSequential):
         Raises:
             ValueError: if the state of a part does not fit; it names the part.
         """
+        moved = tree_map_only(Tensor, lambda tensor: tensor.to(self.generator.device), state)
         try:
-            return super().load_state_dict(on_device(state, self.generator.device), strict, assign)
+            return super().load_state_dict(moved, strict, assign)
         except RuntimeError as error:
             raise ValueError(f"the saved state of policies or closure does not fit: {error}") from error

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
-from rt_torchrl.steps.report import Step, in_words, merged, metrics, plain
+from rt_torchrl.steps.report import Step, in_words, merged, metrics
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation
@@ -195,7 +195,7 @@ class Supervisor:
         """The role and weights that were cleared last."""
 
     @torch.no_grad()
-    def choose(self, live: Role) -> tuple[nn.Module, str, TensorDict]:
+    def choose(self, live: Role) -> tuple[nn.Module, str, dict[str, float | str]]:
         """What may act.
 
         Args:
@@ -208,25 +208,25 @@ class Supervisor:
         Raises:
             ValueError: if nothing may act.
         """
-        episodes, refused = self.episodes(), list[str]()
+        episodes, refused, report = self.episodes(), list[str](), dict[str, float | str]()
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
-            if reason:
-                refused.append(reason)
-            elif episodes is None:
-                return policy, role, metrics(*refused)
-            else:
-                self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
-                return policy, role, metrics(*refused, predicted_violations=share)
+            if not reason:
+                if episodes is not None:
+                    self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
+                    report["predicted_violations"] = share
+                return policy, role, report
+            refused.append(reason)
+            report["reason"] = "; ".join(refused)
         if self._last is not None and episodes is not None:
             role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
             policy.load_state_dict(self._last["weights"])
-            return policy, role, metrics(*refused, predicted_violations=self.predicted(policy, episodes))
+            return policy, role, report | {"predicted_violations": self.predicted(policy, episodes)}
         if self.controller is not None:
-            return self.controller, FIRST, metrics(*refused)
+            return self.controller, FIRST, report
         raise ValueError(
-            f"no policy may act. {'; '.join(refused)}. Widen the limits, or begin with something that keeps them, such "
+            f"no policy may act. {report['reason']}. Widen the limits, or begin with something that keeps them, such "
             "as --start controller."
         )
 
@@ -338,7 +338,7 @@ class Interact(Step):
         flight = self.flights.fly(policy, strength=strength, whole=self.wanting)
         self.keep(flight, role, policy.state_dict())
         acted = policy.report() if isinstance(policy, StateFeedback) else {}
-        return [flight], report.update(metrics(exploration=strength, live=role, **acted))
+        return [flight], metrics(exploration=strength, live=role, **report, **acted)
 
     def keep(self, flight: Flight, pilot: str, weights: Mapping[str, Tensor]) -> None:
         """Remember the record of a flight and, if it is one of a whole episode, what it cost."""
@@ -381,7 +381,7 @@ class Operate(Interact):
         """
         policy, name, report = self.supervisor.choose(live)
         strength = 0.0 if name == FIRST else self.config.exploration.strength(episode)
-        self.operation.hand_over(name, policy, strength=strength, report=plain(report))
+        self.operation.hand_over(name, policy, strength=strength, report=report)
 
     def take(self, live: Role, number: int) -> tuple[Sequence[Flight], TensorDict]:
         """Take every window that has come in; wait until one is of a policy.

@@ -215,8 +215,8 @@ class ScaledPolicy(nn.Module):
 Key = str | tuple[str, ...]
 NEXT: tuple[Key, ...] = tuple(("next", key) for key in ("observation", "reward", "done", "terminated"))
 TRANSITION: tuple[Key, ...] = ("observation", "action", *NEXT)
-BATCH: tuple[Key, ...] = (*TRANSITION, "priority_weight", "steps_to_next_obs")
-"""What a loss reads of a batch, where it is there."""
+BATCH: tuple[Key, ...] = (*TRANSITION, "steps_to_next_obs", "priority_weight")
+"""What a loss reads of a batch."""
 AT_ONCE = 50
 """Number of batches drawn in one call, between which priorities rest: a draw takes as long as half an iteration."""
 
@@ -260,24 +260,20 @@ class ActorCritic:
         self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
         self.method = method or METHODS[config.algorithm]
         self.batch_size = min(config.batch_size, plant.n_steps)
-        correction = self.method.correction
-        self.memory = (replay or LongTermMemory)(correction=correction, generator=generator)
+        self.memory = (replay or LongTermMemory)(correction=self.method.correction, generator=generator)
         stochastic, n_a = self.method.stochastic, len(plant.actions)
         self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
-        widths = (len(plant.observations) + n_a, *self.critic_hidden)
-        critics = [
-            ValueOperator(
-                Critic(widths, normalised=self.method.normalised, generator=generator),
-                in_keys=["observation", "action"],
-            )
-            for _ in range(self.method.critics)
+        widths, pair = (len(plant.observations) + n_a, *self.critic_hidden), ["observation", "action"]
+        networks = [
+            Critic(widths, normalised=self.method.normalised, generator=generator) for _ in range(self.method.critics)
         ]
+        critics = [ValueOperator(network, in_keys=pair) for network in networks]
         module = TensorDictModule(self.actor, ["observation"], ["loc", "scale"] if stochastic else ["action"])
-        spec = Bounded(-1.0, 1.0, (n_a,), dtype=torch.float64, device=generator.device)
-        distribution = {"in_keys": ["loc", "scale"], "distribution_class": TanhNormal, "return_log_prob": True}
-        self.loss = self.method.make_loss(
-            ProbabilisticActor(module, spec=spec, **distribution) if stochastic else module, critics
-        )
+        if stochastic:
+            spec = Bounded(-1.0, 1.0, (n_a,), dtype=torch.float64, device=generator.device)
+            distribution = {"distribution_class": TanhNormal, "return_log_prob": True}
+            module = ProbabilisticActor(module, in_keys=["loc", "scale"], spec=spec, **distribution)
+        self.loss = self.method.make_loss(module, critics)
         self.loss.make_value_estimator(gamma=config.discount)
         targets = any(name.startswith("target_") for name, _ in self.loss.named_buffers())
         self.target = SoftUpdate(self.loss, tau=config.target_rate) if targets else None
@@ -287,7 +283,7 @@ class ActorCritic:
         self.shortest = config.return_steps
         """Least number of control intervals in a row that can be stored."""
         self._returns = MultiStep(config.discount, config.return_steps)
-        self._iterations: dict[tuple[Any, ...], Iteration] = {}
+        self._iterations: dict[str, Iteration] = {}
         self._traced = copy.deepcopy(policy)
 
     def store(self, episode: TensorDictBase) -> None:
@@ -325,7 +321,7 @@ class ActorCritic:
         if over:  # TorchRL moves all that is next, but not what says whether it is an end
             last = torch.arange(whole, device=returns.device) + returns["steps_to_next_obs"].flatten() == whole
             returns["next", "terminated"] = last.unsqueeze(-1)
-        return returns.select(*BATCH, strict=False)
+        return returns.select(*BATCH[:-1])
 
     @torch.no_grad()
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
@@ -391,15 +387,13 @@ class ActorCritic:
         for kind, count in phases:
             for first in range(0, count, AT_ONCE):
                 drawn = self.memory.sample(min(AT_ONCE, count - first) * self.batch_size).to(self.generator.device)
-                keys = [key for key in BATCH if key in drawn.keys(include_nested=True)]
                 errors = list[Tensor]()
-                for k, batch in enumerate(zip(*(drawn[key].split(self.batch_size) for key in keys), strict=True)):
+                for k, batch in enumerate(zip(*(drawn[key].split(self.batch_size) for key in BATCH), strict=True)):
                     safe_point()
                     what = "both" if delay and (first + k + 1) % delay == 0 else kind
-                    name = (what, *keys)
-                    if name not in self._iterations:
-                        self._iterations[name] = Iteration(self, what, keys)
-                    results = self._iterations[name](batch)
+                    if what not in self._iterations:
+                        self._iterations[what] = Iteration(self, what)
+                    results = self._iterations[what](batch)
                     errors += [results.pop("errors")] if "errors" in results else []
                     for entry, value in results.items():
                         results_by_name.setdefault(entry, []).append(value)
@@ -502,11 +496,10 @@ class Iteration:
     Args:
         learner: learner whose weights change.
         kind: ``critic``, ``actor`` or ``both``.
-        keys: what the batches hold.
     """
 
-    def __init__(self, learner: ActorCritic, kind: str, keys: Sequence[Key]):
-        self.learner, self.keys = learner, list(keys)
+    def __init__(self, learner: ActorCritic, kind: str):
+        self.learner = learner
         self.critic, self.actor = kind != "actor", kind != "critic"
         self.target = learner.target if kind == "both" or (learner.method.delay == 0 and self.critic) else None
         self._graph: Callable[..., dict[str, Tensor]] | None = None
@@ -516,7 +509,7 @@ class Iteration:
         """Make the iteration.
 
         Args:
-            batch: tensors of a batch, in the order of the keys.
+            batch: tensors of a batch, in the order of ``BATCH``.
 
         Returns:
             Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
@@ -529,7 +522,7 @@ class Iteration:
     def eager(self, *batch: Tensor) -> dict[str, Tensor]:
         """The iteration as TorchRL and torch make it."""
         learner = self.learner
-        transitions = TensorDict(dict(zip(self.keys, batch, strict=True)), batch_size=[len(batch[0])])
+        transitions = TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])])
         losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
         results: dict[str, Tensor] = {}
         steps = list[tuple[Adam, list[Tensor]]]()

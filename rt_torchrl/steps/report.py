@@ -10,7 +10,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
-from torch.utils._pytree import tree_map_only
 
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -61,12 +60,6 @@ def metrics(*reasons: str, **values: float | Tensor | str) -> TensorDict:
         if isinstance(text, str):
             report.set_non_tensor(key, text)
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
-
-
-def plain(report: TensorDict) -> dict[str, float | str]:
-    """The entries of a report as numbers and texts."""
-    entries = {key: report[key] for key in report.keys()}  # noqa: SIM118  (a TensorDict iterates over its batch)
-    return {key: value if isinstance(value, str) else float(value) for key, value in entries.items()}
 
 
 def merged(report: Report, other: TensorDictBase) -> Report:
@@ -127,11 +120,6 @@ def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
         settings = {key: v.tolist() if isinstance(v, Tensor | np.ndarray) else v for key, v in values.items()}
         parts.append((name, type(part), part.extra_repr(), settings))
     return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
-
-
-def on_device(state: dict[str, Any], device: torch.device) -> dict[str, Any]:
-    """The state with all its tensors on a device."""
-    return tree_map_only(Tensor, lambda tensor: tensor.to(device), state)
 
 
 def record_of(episode: TensorDictBase) -> Trajectory:

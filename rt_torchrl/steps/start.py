@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 
 from rt_torchrl.plants.plant import Plant, final_cost
 from rt_torchrl.steps.config import Arm, Role
@@ -157,19 +157,9 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     reward = -plant.running_cost(t[:-1], states[:-1], actions, inputs)
     if n == plant.n_steps:
         reward = torch.cat([reward[:-1], reward[-1:] - final_cost(plant, states[-1:]) / plant.dt])
-    never: Tensor = torch.zeros(n, 1, dtype=torch.bool, device=states.device)
-    done = never.clone()
+    done = torch.zeros(n, 1, dtype=torch.bool, device=states.device)
     done[-1] = True
     over = done & plant.ended(states[1:]).unsqueeze(-1)
-    ended = {"reward": reward.unsqueeze(-1), "done": done, "truncated": done & ~over, "terminated": over}
-    flags = {key: never.clone() for key in ("done", "truncated", "terminated")}
-    return TensorDict(
-        {
-            "observation": observation[:-1],
-            "action": actions,
-            **flags,
-            "next": {"observation": observation[1:], **ended},
-        },
-        batch_size=[n],
-        device=states.device,
-    )
+    ends = {"reward": reward.unsqueeze(-1), "done": done, "truncated": done & ~over, "terminated": over}
+    entries = {"observation": observation[:-1], "action": actions, "next": {"observation": observation[1:], **ends}}
+    return TensorDict(entries, batch_size=[n], device=states.device)
