@@ -148,15 +148,6 @@ def test_a_plan_that_is_stuck_is_made_from_other_weights_too(limit, led_back, mo
     assert (virtual.cost(policy, EPISODES) < 1.001) is led_back and ("start" in report) is led_back
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "promised", "expected"),
-    [(1.0, 1.0, 1e3, True), (1.0, 0.5, 1e3, False), (1.0, 1.0, 1.0, False), (-1.0, -1.0, 1e3, True)],
-)
-def test_a_descent_stalls_where_it_gains_nothing_of_what_its_gradient_promises(before, after, promised, expected):
-    planner = Still(LinearGain([[3.0, 4.0]]), belief_of().virtual)
-    assert planner.stalled(before, after, promised / 5.0) is expected
-
-
 def test_extreme_starts_are_beyond_nearly_all_random_ones():
     plant = LinearQuadratic(horizon=1.0)
     found = extreme_states(plant, 1000, CPU)
