@@ -122,7 +122,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
     found.referee.live = live
     episode = flown(found, *STEPS[:-1])
     optimisers = {
-        "model_free": lambda: found.learner.actor_adam.steps[0].item(),
+        "model_free": lambda: found.learner.actor_adam.parts[0].item(),
         "model_based": lambda: found.planner.descent._optimiser.state,
     }
     idle, before = other_than(live), weights(found.policies[live])

@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_flatten
 from torchrl.objectives import DDPGLoss
 
 from rt_torchrl import LearnerConfig, Rollout, SaturatedAffine, SaturatedMLP
-from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, Iteration, LearningMethod, LongTermMemory
+from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, LearningMethod, LongTermMemory, iteration, traced
 
 GAMMA = 0.9
 PLANT = LinearQuadratic()
@@ -126,30 +126,30 @@ def batches_of(found, count):
 )
 def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, return_steps):
     """Also with other weights, other batches, after a restart, and after a state was loaded."""
-    traced, eager = (learner(algorithm, policy=policy, return_steps=return_steps) for _ in range(2))
+    ours, eager = (learner(algorithm, policy=policy, return_steps=return_steps) for _ in range(2))
     generator = seeded(4)
     for seed in range(4):
         episode = explored(20, seed=seed)
         episode["next", "terminated"] = torch.rand(len(episode), 1, generator=generator) < 0.05
-        traced.store(episode), eager.store(episode)
-    batches = batches_of(traced, 6)
+        ours.store(episode), eager.store(episode)
+    batches = batches_of(ours, 6)
     kinds = ("critic", "actor") if METHODS[algorithm].delay == 0 else ("critic", "both")
-    flat = {kind: Iteration(traced, kind) for kind in kinds}
-    start = copy.deepcopy(traced.state_dict())
+    flat = {kind: traced(ours, kind, batches[0]) for kind in kinds}
+    start = copy.deepcopy(ours.state_dict())
     for k, batch in enumerate(batches):
         for kind in kinds:
             torch.manual_seed(k)
-            found = flat[kind](batch)
+            found = flat[kind](*batch)
             torch.manual_seed(k)
-            expected = Iteration(eager, kind).eager(*batch)
+            expected = iteration(eager, kind, *batch)
             assert_equal(found, expected)
         if k == 2:
-            traced.restart(), eager.restart()
+            ours.restart(), eager.restart()
         if k == 4:
-            traced.load_state_dict(start), eager.load_state_dict(start)
+            ours.load_state_dict(start), eager.load_state_dict(start)
         for name in ("loss", "critic_adam", "actor_adam"):
-            assert_equal(getattr(traced, name).state_dict(), getattr(eager, name).state_dict())
-    learned, before = (next(iter(policy.parameters())) for policy in (traced.policy, POLICIES[policy]()))
+            assert_equal(getattr(ours, name).state_dict(), getattr(eager, name).state_dict())
+    learned, before = (next(iter(policy.parameters())) for policy in (ours.policy, POLICIES[policy]()))
     assert not torch.equal(learned, before)
 
 
@@ -160,7 +160,7 @@ def test_an_iteration_takes_the_steps_of_torchs_adam(algorithm):
     ours.store(explored(20)), others.store(explored(20))
     (batch,) = batches_of(ours, 1)
     torch.manual_seed(0)
-    Iteration(ours, "both")(batch)
+    traced(ours, "both", batch)(*batch)
     torch.manual_seed(0)
     losses = others.loss(TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])]))
     critic = losses["loss_qvalue"] if "loss_qvalue" in losses else losses["loss_value"]
@@ -170,7 +170,7 @@ def test_an_iteration_takes_the_steps_of_torchs_adam(algorithm):
         loss.backward(inputs=weights[name], retain_graph=True)
     nn.utils.clip_grad_norm_(weights["actor_adam"], METHODS[algorithm].gradient_limit)
     for name, trained in weights.items():
-        torch.optim.Adam(trained, lr=getattr(others, name).rate).step()
+        torch.optim.Adam(trained, lr=getattr(others, name).defaults["lr"]).step()
         torch.testing.assert_close(getattr(ours, name).weights, trained, rtol=0, atol=1e-9)
 
 
@@ -264,13 +264,12 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
 def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, order):
     found, kinds, sizes = learner(algorithm, critic_iterations=7, actor_iterations=4, batch_size=64), [], []
     memory = filled(explored(20), found)
-    call, sample = Iteration.__call__, memory.sample
+    sample = memory.sample
 
-    def noted(iteration, batch):
-        kinds.append("both" if iteration.critic and iteration.actor else "critic" if iteration.critic else "actor")
-        return call(iteration, batch)
+    def noted(learner, kind, batch):
+        return lambda *batch: kinds.append(kind) or iteration(learner, kind, *batch)
 
-    monkeypatch.setattr(Iteration, "__call__", noted)
+    monkeypatch.setattr("rt_torchrl.steps.learn.traced", noted)
     monkeypatch.setattr(memory, "sample", lambda size: sizes.append(size) or sample(size))
     found.update()
     assert kinds == order

@@ -14,11 +14,8 @@ from rt_torchrl.systems.exploration import ExplorationConfig
 Role = Literal["model_free", "model_based"]
 Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
-RefereeName = Literal["decision_tree", "expected_cost"]
-LargeScale = Literal["met", "mixed", "drawn"]
 EXPERIENCE = 100
 """Number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; the paper has 1."""
-LearnerName = Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"]
 
 
 @configuration
@@ -45,7 +42,7 @@ class LearnerConfig:
         actor_rate: learning rate of the policy (Adam).
     """
 
-    algorithm: LearnerName = "ddpg"
+    algorithm: Literal["ddpg", "relaxed_ddpg", "td3", "sac", "crossq", "redq"] = "ddpg"
     critic_iterations: Count = 200
     actor_iterations: Count = 200
     batch_size: AtLeastOne = 128
@@ -77,7 +74,7 @@ class ExogenousConfig:
     kernel_width: Positive = 2.0
     penalty: Positive = 10.0
     tube: Positive = 0.05
-    large_scale: LargeScale = "met"
+    large_scale: Literal["met", "mixed", "drawn"] = "met"
 
 
 @configuration
@@ -122,7 +119,7 @@ class RefereeConfig:
             a clone.
     """
 
-    rule: RefereeName = "expected_cost"
+    rule: Literal["decision_tree", "expected_cost"] = "expected_cost"
     patience: Count = 2
     clone_patience: Count = 3
 

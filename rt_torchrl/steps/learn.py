@@ -24,7 +24,6 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn.utils import get_total_norm, parameters_to_vector
-from torch.optim.adam import adam
 from torch.utils._pytree import tree_flatten
 from torchrl.data import Bounded, LazyTensorStorage, MultiStep, RoundRobinWriter, TensorDictPrioritizedReplayBuffer
 from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, ValueOperator
@@ -283,7 +282,7 @@ class ActorCritic:
         self.shortest = config.return_steps
         """Least number of control intervals in a row that can be stored."""
         self._returns = MultiStep(config.discount, config.return_steps)
-        self._iterations: dict[str, Iteration] = {}
+        self._iterations: dict[str, Callable[..., dict[str, Tensor]]] = {}
         self._traced = copy.deepcopy(policy)
 
     def store(self, episode: TensorDictBase) -> None:
@@ -380,6 +379,7 @@ class ActorCritic:
         message = f"update of model_free taken back: {reason}; use smaller learning rates or reward_scale"
         return TensorDict().set_non_tensor("reason", message)
 
+    @torch.no_grad()
     def _iterate(self) -> TensorDict:
         config, delay = self.config, self.method.delay
         results_by_name: dict[str, list[Tensor]] = {}
@@ -392,8 +392,8 @@ class ActorCritic:
                     safe_point()
                     what = "both" if delay and (first + k + 1) % delay == 0 else kind
                     if what not in self._iterations:
-                        self._iterations[what] = Iteration(self, what)
-                    results = self._iterations[what](batch)
+                        self._iterations[what] = traced(self, what, batch)
+                    results = self._iterations[what](*batch)
                     errors += [results.pop("errors")] if "errors" in results else []
                     for entry, value in results.items():
                         results_by_name.setdefault(entry, []).append(value)
@@ -434,7 +434,7 @@ def finite(state: Mapping[str, Any]) -> bool:
     return all(bool(part.isfinite().all()) for part in tensors)
 
 
-class Adam:
+class Adam(torch.optim.Adam):
     """Adam by torch's fused kernel, with moments that stay where they are, so that a traced graph may hold them.
 
     Args:
@@ -443,36 +443,22 @@ class Adam:
     """
 
     def __init__(self, weights: list[nn.Parameter], rate: float):
-        self.weights, self.rate = weights, rate
-        self.moments = [[torch.zeros_like(w, requires_grad=False) for w in weights] for _ in range(2)]
-        self.steps = [torch.zeros((), dtype=torch.float32, device=w.device) for w in weights]
-        self.parts = [*self.moments[0], *self.moments[1], *self.steps]
-        """All tensors of its state."""
+        super().__init__(weights, lr=rate, fused=True)
+        self.weights, self.parts = weights, list[Tensor]()
+        for weight in weights:
+            step = torch.zeros((), dtype=torch.float32, device=weight.device)
+            moments = [torch.zeros_like(weight, requires_grad=False) for _ in range(2)]
+            self.state[weight] = dict(zip(("step", "exp_avg", "exp_avg_sq"), (step, *moments), strict=True))
+            self.parts += [step, *moments]
 
-    @torch.no_grad()
-    def step(self, gradients: list[Tensor]) -> None:
+    def descend(self, gradients: list[Tensor]) -> None:
         """Change the weights by their gradients, whose layout in memory may differ from that of the weights."""
-        # The fused kernel reads gradients in the order of the weights, and those of several critics have another one.
-        gradients = [
-            gradient if gradient.stride() == weight.stride() else torch.empty_like(weight).copy_(gradient)
-            for weight, gradient in zip(self.weights, gradients, strict=True)
-        ]
-        adam(
-            cast(list[Tensor], self.weights),
-            gradients,
-            self.moments[0],
-            self.moments[1],
-            max_exp_avg_sqs=[],
-            state_steps=self.steps,
-            fused=True,
-            amsgrad=False,
-            lr=self.rate,
-            beta1=0.9,
-            beta2=0.999,
-            eps=1e-8,
-            weight_decay=0.0,
-            maximize=False,
-        )
+        for weight, gradient in zip(self.weights, gradients, strict=True):
+            # The fused kernel reads gradients in the order of the weights; those of several critics have another one.
+            same = gradient.stride() == weight.stride()
+            weight.grad = gradient if same else torch.empty_like(weight).copy_(gradient)
+        self.step()
+        self.zero_grad()
 
     def restart(self) -> None:
         """Forget all steps."""
@@ -487,87 +473,70 @@ class Adam:
             part.copy_(saved)
 
 
-class Iteration:
-    """One iteration: loss, gradients, steps of the optimisers and of the targets, as a flat graph.
-
-    The graph holds weights, moments and targets by reference; a batch is its input. What a policy has beside its
-    weights and buffers, such as numbers in attributes, is read once, when the graph is made.
+@torch.enable_grad()
+def iteration(learner: ActorCritic, kind: str, *batch: Tensor) -> dict[str, Tensor]:
+    """One iteration as TorchRL and torch make it: loss, gradients, steps of the optimisers and of the targets.
 
     Args:
         learner: learner whose weights change.
         kind: ``critic``, ``actor`` or ``both``.
+        batch: tensors of a batch, in the order of ``BATCH``.
+
+    Returns:
+        Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
     """
+    critic, method = kind != "actor", learner.method
+    transitions = TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])])
+    losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
+    results: dict[str, Tensor] = {}
+    steps = list[tuple[Adam, list[Tensor]]]()
+    if critic:
+        loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
+        gradients = slopes(loss, learner.critic_adam.weights)
+        errors = learner.sizes(transitions["td_error"].detach())
+        results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
+        results["critic_gradient"] = get_total_norm(gradients)
+        steps.append((learner.critic_adam, gradients))
+    if kind != "critic":
+        loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
+        gradients = slopes(loss, learner.actor_adam.weights)
+        norm = get_total_norm(gradients)
+        share = (method.gradient_limit / (norm + TINY)).clamp(max=1.0)
+        results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
+        steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
+    relaxed = learner.critic_adam.weights if critic and method.relaxed else []
+    before = [weight.detach().clone() for weight in relaxed]
+    for optimiser, gradients in steps:
+        optimiser.descend(gradients)
+    with torch.no_grad():
+        for weight, earlier in zip(relaxed, before, strict=True):  # w ← τ w + (1 − τ) w'
+            weight.copy_(torch.lerp(earlier, weight, learner.config.target_rate))
+    if learner.target is not None and critic and (kind == "both" or method.delay == 0):
+        learner.target.step()
+    return results
 
-    def __init__(self, learner: ActorCritic, kind: str):
-        self.learner = learner
-        self.critic, self.actor = kind != "actor", kind != "critic"
-        self.target = learner.target if kind == "both" or (learner.method.delay == 0 and self.critic) else None
-        self._graph: Callable[..., dict[str, Tensor]] | None = None
 
-    @torch.no_grad()
-    def __call__(self, batch: Sequence[Tensor]) -> dict[str, Tensor]:
-        """Make the iteration.
+@torch.no_grad()
+def traced(learner: ActorCritic, kind: str, batch: Sequence[Tensor]) -> Callable[..., dict[str, Tensor]]:
+    """The iteration of batches like this one as a flat graph, or as it is where it cannot be traced.
 
-        Args:
-            batch: tensors of a batch, in the order of ``BATCH``.
-
-        Returns:
-            Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
-        """
-        if self._graph is None:
-            self._graph = self._traced(batch)
-        return self._graph(*batch)
-
-    @torch.enable_grad()
-    def eager(self, *batch: Tensor) -> dict[str, Tensor]:
-        """The iteration as TorchRL and torch make it."""
-        learner = self.learner
-        transitions = TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])])
-        losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
-        results: dict[str, Tensor] = {}
-        steps = list[tuple[Adam, list[Tensor]]]()
-        if self.critic:
-            loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
-            gradients = slopes(loss, learner.critic_adam.weights)
-            errors = learner.sizes(transitions["td_error"].detach())
-            results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
-            results["critic_gradient"] = get_total_norm(gradients)
-            steps.append((learner.critic_adam, gradients))
-        if self.actor:
-            loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
-            gradients = slopes(loss, learner.actor_adam.weights)
-            norm = get_total_norm(gradients)
-            share = (learner.method.gradient_limit / (norm + TINY)).clamp(max=1.0)
-            results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
-            steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
-        relaxed = learner.critic_adam.weights if self.critic and learner.method.relaxed else []
-        before = [weight.detach().clone() for weight in relaxed]
-        for optimiser, gradients in steps:
-            optimiser.step(gradients)
-        with torch.no_grad():
-            for weight, earlier in zip(relaxed, before, strict=True):  # w ← τ w + (1 − τ) w'
-                weight.copy_(torch.lerp(earlier, weight, learner.config.target_rate))
-        if self.target is not None:
-            self.target.step()
-        return results
-
-    def _traced(self, batch: Sequence[Tensor]) -> Callable[..., dict[str, Tensor]]:
-        """The iteration as a flat graph, or as it is where it cannot be traced; nothing is changed."""
-        learner = self.learner
-        state = [*learner.loss.parameters(), *learner.loss.buffers()]
-        state += [*learner.critic_adam.parts, *learner.actor_adam.parts]
-        before = [part.detach().clone() for part in state]
-        device = learner.generator.device
-        try:
-            with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
-                return flat(make_fx(self.eager)(*batch))
-        except RuntimeError as error:
-            policy = type(learner.policy).__name__
-            warnings.warn(f"Step 2 is slower, because {policy} cannot be traced: {error}", stacklevel=4)
-            return self.eager
-        finally:
-            for part, saved in zip(state, before, strict=True):
-                part.copy_(saved)
+    The graph holds weights, moments and targets by reference; a batch is its input. What a policy has beside its
+    weights and buffers, such as numbers in attributes, is read now. Nothing is changed.
+    """
+    eager, device = functools.partial(iteration, learner, kind), learner.generator.device
+    state = [*learner.loss.parameters(), *learner.loss.buffers()]
+    state += [*learner.critic_adam.parts, *learner.actor_adam.parts]
+    before = [part.detach().clone() for part in state]
+    try:
+        with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
+            return flat(make_fx(eager)(*batch))
+    except RuntimeError as error:
+        policy = type(learner.policy).__name__
+        warnings.warn(f"Step 2 is slower, because {policy} cannot be traced: {error}", stacklevel=4)
+        return eager
+    finally:
+        for part, saved in zip(state, before, strict=True):
+            part.copy_(saved)
 
 
 TINY = 1e-6
@@ -590,8 +559,10 @@ def flat(module: GraphModule) -> Callable[..., dict[str, Tensor]]:
     small operation.
     """
     graph = module.graph
-    for node in graph.nodes:
-        if node.target in PASSED:
+    for node in reversed(graph.nodes):
+        if getattr(node.target, "namespace", "") == "profiler":  # marks of the optimisers' steps
+            graph.erase_node(node)
+        elif node.target in PASSED:
             node.replace_all_uses_with(node.all_input_nodes[0])
     graph.eliminate_dead_code()
     held = [node for node in graph.nodes if node.op == "get_attr"]
