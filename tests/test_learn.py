@@ -10,10 +10,10 @@ from scipy.stats import chisquare
 from seeds_and_numbers import seeded
 from tensordict import TensorDict
 from torch import nn
-from torch.utils._pytree import tree_flatten
 from torchrl.objectives import DDPGLoss
 
 from rt_torchrl import LearnerConfig, Rollout, SaturatedAffine, SaturatedMLP
+from rt_torchrl.steps.belief import equal
 from rt_torchrl.steps.learn import BATCH, METHODS, ActorCritic, LearningMethod, LongTermMemory, iteration, traced
 
 GAMMA = 0.9
@@ -105,13 +105,6 @@ def values(found, observation, action, *, target=False):
     return torch.stack(of_each)
 
 
-def assert_equal(state, other):
-    """Two states hold the same numbers."""
-    (ours, structure), (its, its_structure) = tree_flatten(dict(state)), tree_flatten(dict(other))
-    assert structure == its_structure
-    assert all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b for a, b in zip(ours, its, strict=True))
-
-
 def batches_of(found, count):
     drawn = found.memory.sample(count * found.batch_size)
     return list(zip(*(drawn[key].split(found.batch_size) for key in BATCH), strict=True))
@@ -142,13 +135,13 @@ def test_a_traced_iteration_is_that_of_torchrl_to_the_bit(algorithm, policy, ret
             found = flat[kind](*batch)
             torch.manual_seed(k)
             expected = iteration(eager, kind, *batch)
-            assert_equal(found, expected)
+            assert equal(found, expected)
         if k == 2:
             ours.restart(), eager.restart()
         if k == 4:
             ours.load_state_dict(start), eager.load_state_dict(start)
         for name in ("loss", "critic_adam", "actor_adam"):
-            assert_equal(getattr(ours, name).state_dict(), getattr(eager, name).state_dict())
+            assert equal(dict(getattr(ours, name).state_dict()), dict(getattr(eager, name).state_dict()))
     learned, before = (next(iter(policy.parameters())) for policy in (ours.policy, POLICIES[policy]()))
     assert not torch.equal(learned, before)
 
@@ -249,8 +242,8 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
     report = found.update()
     assert report["reason"].startswith("update of model_free taken back: ")
     for name in ("loss", "critic_adam", "actor_adam"):
-        assert_equal(found.state_dict()[name], before[0][name])
-    assert_equal(found.policy.state_dict(), before[1])
+        assert equal(dict(found.state_dict()[name]), dict(before[0][name]))
+    assert equal(found.policy.state_dict(), before[1])
     # It can go on with other rates.
     other = learner(algorithm, critic_iterations=6, actor_iterations=3)
     other.load_state_dict(found.state_dict())
