@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import errno
 import json
 import math
 import os
@@ -12,23 +11,14 @@ from pathlib import Path
 from typing import Any
 
 PARTIAL = ".partial"
-REMEDY = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room"),
-    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), "make its folder"),
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "write where you may, or allow it here"),
-}
-"""What to do about an error of the operating system."""
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file whole or not at all: whatever happens, it has its old content or ``content``.
 
     Raises:
-        OSError: if the file cannot be written, such as on a full disk; its old content stays. The one exception is a
-            folder that cannot be flushed: the new content is there, and a power cut may undo it. The message says what
-            is the case.
+        OSError: if the file cannot be written, such as on a full disk; its old content stays.
     """
-    written = False
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PARTIAL}")
     try:
         with partial.open("xb") as file:
@@ -36,34 +26,22 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-        written = True
-        _flush_folder(path.parent)
-    except BaseException as error:
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror or error}; what was there before is intact", str(path)) from error
+    finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            reason = error.strerror or str(error)
-            if written:
-                state = "the file is written, but a power cut may undo it"
-            else:
-                state = "what was there before is intact" if os.path.lexists(path) else "nothing is written"
-                state = "; ".join(filter(None, [state, REMEDY.get(error.errno or 0)]))
-            raise OSError(error.errno, f"{reason}; {state}", str(path)) from error
-        raise
+    _flush_folder(path.parent)
 
 
 def _flush_folder(folder: Path) -> None:
     """Put the names in a folder on the disk, so that a power cut does not bring an old name back."""
-    if os.name == "nt":  # folders cannot be opened there
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that flush no folder
-            raise
-    finally:
-        os.close(descriptor)
+    with contextlib.suppress(OSError):  # Windows opens no folder, and some file systems flush none
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def remove_partials(folder: Path) -> None:
@@ -138,12 +116,11 @@ def new_folder(parent: Path, ending: str = "") -> Path:
     Raises:
         OSError: if the folder cannot be made.
     """
-    stamp, number = time.strftime("%Y%m%d-%H%M%S"), 1
     while True:
-        folder = parent / f"{stamp if number == 1 else f'{stamp}-{number}'}{ending}"
+        folder = parent / f"{time.strftime('%Y%m%d-%H%M%S')}{ending}"
         try:
             folder.mkdir(parents=True)
-        except FileExistsError:  # of the same second
-            number += 1
+        except FileExistsError:  # of this second
+            time.sleep(0.1)
         else:
             return folder

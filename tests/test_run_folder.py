@@ -1,6 +1,5 @@
 """A run folder and its files: who writes, what is overwritten and resumed, and damage that is noticed."""
 
-import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -8,7 +7,6 @@ import json
 import os
 import pickle
 import signal
-import stat
 import threading
 import time
 from pathlib import Path
@@ -45,31 +43,25 @@ def contents(path):
 
 
 def test_a_folder_in_use_is_refused_until_it_is_let_go(tmp_path):
+    (tmp_path / ".checkpoint.pt.1-ab.partial").touch()  # left by a killed writer
     folder = RunFolder(RunConfig(log_dir=tmp_path), "p")
+    assert not list(tmp_path.glob(".*.partial"))
     with pytest.raises(ValueError, match="log_dir=.* is in use by another training"):
         RunFolder(RunConfig(log_dir=tmp_path), "p")
     folder.release()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
 
 
-def test_what_killed_writers_left_is_removed(tmp_path):
-    (tmp_path / ".checkpoint.pt.1-ab.partial").touch()
-    RunFolder(RunConfig(log_dir=tmp_path), "p").release()
-    assert not list(tmp_path.glob(".*.partial"))
-
-
-def changed_twinning():
-    default = RunConfig().twinning
-    rates = dataclasses.replace(default.learner, actor_rate=1e-3, discount=0.5)
-    return dataclasses.replace(default, learner=rates)
-
-
 def test_a_run_is_not_resumed_with_other_options(tmp_path):
     begun(tmp_path)
-    before = contents(tmp_path)
+    before, default = contents(tmp_path), RunConfig().twinning
+    learner = dataclasses.replace(default.learner, actor_rate=1e-3, discount=0.5)
     for options, named in (
         ({"hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
-        ({"twinning": changed_twinning()}, "actor_rate is 0.001 here and was 0.002.*learner.discount is 0.5"),
+        (
+            {"twinning": dataclasses.replace(default, learner=learner)},
+            "actor_rate is 0.001 here and was 0.002.*learner.discount is 0.5",
+        ),
     ):
         with pytest.raises(ValueError, match=named):
             RunFolder(RunConfig(log_dir=tmp_path, resume=True, **options), "p")
@@ -87,12 +79,14 @@ def test_a_run_is_resumed_with_harmless_options(tmp_path):
 
 
 def test_what_cannot_be_resumed_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="holds no run to resume: it has no config.json. Start without --resume"):
-        RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
+    def refused():
+        with pytest.raises(ValueError, match="holds no run to resume: it needs config.json and a checkpoint"):
+            RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
+
+    refused()
     begun(tmp_path)
     (tmp_path / "weights.pt").touch()
-    with pytest.raises(ValueError, match="finished run without a checkpoint.*another folder"):
-        RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
+    refused()
 
 
 def test_what_ran_is_kept_for_every_start(tmp_path):
@@ -165,63 +159,20 @@ def test_a_file_runs_no_code(tmp_path, legacy):
         archive = file.read_bytes()
         seal = b"sha256:" + hashlib.sha256(archive).hexdigest().encode()
         file.write_bytes(archive[:-2] + len(seal).to_bytes(2, "little") + seal)
-    with pytest.raises(ValueError, match="checkpoint.pt is (not loaded|damaged, or no file of a run)"):
+    with pytest.raises(ValueError, match="checkpoint.pt is damaged, or no file of a run"):
         load_tensors(file)
     assert not trace.exists()
-
-
-class Full(contextlib.closing):
-    """A file on a full disk, which takes only a part of the content."""
-
-    def __init__(self, file):
-        super().__init__(self)
-        self.file, self.close = file, file.close
-
-    def write(self, content):
-        self.file.write(content[:10])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     file = tmp_path / "checkpoint.pt"
     save_tensors(file, CONTENT)
-    opened = Path.open
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "open", lambda self, mode="r": Full(opened(self, mode)))
-        with pytest.raises(OSError, match="No space left on device.*intact; make room.*checkpoint.pt"):
+        patched.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
+        with pytest.raises(OSError, match="No space left on device; what was there before is intact.*checkpoint.pt"):
             save_tensors(file, {"other": 1})
     assert same(load_tensors(file), CONTENT)
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
-
-
-def opening_fails(number):
-    return Path, "open", Mock(side_effect=OSError(number, os.strerror(number)))
-
-
-def no_folder_flushed(descriptor):
-    if stat.S_ISDIR(os.fstat(descriptor).st_mode):
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
-@pytest.mark.parametrize(
-    ("old", "patch", "said", "left"),
-    [
-        (None, opening_fails(errno.ENOENT), "nothing is written; make its folder", None),
-        ("old", opening_fails(errno.EROFS), "what was there before is intact; write where you may", "old"),
-        # Only a power cut would bring the old content back.
-        ("old", (os, "fsync", no_folder_flushed), "the file is written, but a power cut may undo it", "{}\n"),
-    ],
-)
-def test_a_write_that_fails_says_what_is_there_now(old, patch, said, left, tmp_path, monkeypatch):
-    file = tmp_path / "metrics.json"
-    if old is not None:
-        file.write_text(old)
-    with monkeypatch.context() as patched:
-        patched.setattr(*patch)
-        with pytest.raises(OSError, match=rf"{said}.*metrics\.json") as error:
-            write_json(file, {})
-    assert "room" not in str(error.value) and ("intact" in str(error.value)) == (left == "old")
-    assert (file.read_text() if file.exists() else None) == left
 
 
 def test_numbers_that_json_does_not_have_are_null(tmp_path):
@@ -247,33 +198,6 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(
-    ("where", "failing", "said"),
-    [
-        (
-            (Path, "read_bytes"),
-            Mock(side_effect=OSError(errno.ESTALE, "")),
-            os.strerror(errno.ESTALE),
-        ),  # without a name
-        ((Path, "read_bytes"), Mock(side_effect=MemoryError), os.strerror(errno.ENOMEM)),
-        ((torch, "load"), lambda *_, **__: torch.empty(2**57), os.strerror(errno.ENOMEM)),
-    ],
-)
-def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
-    where, failing, said, folder, tmp_path, monkeypatch
-):
-    """The earlier checkpoint would be sound: a training that took it would fly an episode again."""
-    algorithm = small_run(tmp_path / "run", **QUICK).algorithm
-    for name in ("checkpoint-0002.pt", "checkpoint-0001.pt"):
-        (tmp_path / name).write_bytes((folder / "checkpoint-0002.pt").read_bytes())
-    with monkeypatch.context() as patched:
-        patched.setattr(*where, failing)
-        with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint-0002\.pt"):
-            run_folder.load_checkpoint(tmp_path, algorithm)
-    assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint-0002.pt"]
-    assert len(run_folder.load_checkpoint(tmp_path, algorithm)) == 2
-
-
 PARTS = {"learner": "learn", "short_term": "interact", "virtual": "inputs", "referee": "switch", "env": "interact"}
 
 
@@ -288,10 +212,10 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     for part, step in PARTS.items():
         found = load_tensors(folder / file.name)
         del found["state"]["algorithm"][f"module.{step}._extra_state"][part]
-        refused(found, f"weights do not fit this training.*{part}")
+        refused(found, f"weights of .* do not fit this training.*{part}")
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
-    refused(found, r"(?s)weights do not fit this training.*policies.*model_free\.gain")
+    refused(found, r"(?s)weights of .* do not fit this training.*policies.*model_free\.gain")
     refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 7")
 
 
@@ -301,7 +225,7 @@ def test_a_config_of_somebody_else_is_not_overwritten(tmp_path):
         small_run(tmp_path, episodes=1, **QUICK)
 
 
-def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(tmp_path, monkeypatch, capsys):
+def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(tmp_path, monkeypatch):
     def killed(self, episode):
         raise KeyboardInterrupt
 
@@ -311,7 +235,6 @@ def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(
             with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
                 small_run(tmp_path, episodes=1, **QUICK).train()
     resumed = small_run(tmp_path, episodes=1, resume=True, **QUICK).train()
-    assert "has no episode done yet: it starts from its beginning" in capsys.readouterr().out
     whole = small_run(tmp_path / "whole", episodes=1, **QUICK).train()
     for record in (*resumed["episodes"], *whole["episodes"]):
         record["seconds"] = None

@@ -1,9 +1,6 @@
 """The folder of a run: its lock, its checkpoints, and its files of tensors, whose damage is noticed."""
 
-import errno
 import io
-import os
-import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,10 +16,6 @@ from rt_torchrl.runs.settings import FILE, read_settings, require_same, write_se
 
 if TYPE_CHECKING:
     from rt_torchrl.algorithm import ReinforcementTwinning  # only its type: who reads weights needs no TorchRL
-
-
-class DamagedFileError(ValueError):
-    """A file that is not what a run has written: damaged, foreign, or such that loading it would run code."""
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
@@ -45,44 +38,24 @@ def load_tensors(path: Path) -> dict[str, Any]:
     The checksums of the file, which is a zip archive, are compared first.
 
     Raises:
-        DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
+        ValueError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
             object is not built.
-        OSError: if the file cannot be read, or memory is short, which says nothing of what it holds.
+        OSError: if the file cannot be read.
     """
-    try:
-        return _loaded(path)
-    except (OSError, MemoryError) as error:
-        number = errno.ENOMEM if isinstance(error, MemoryError) else error.errno
-        reason = os.strerror(number) if number else str(error)
-        raise OSError(number, f"{reason}; the file is not read and not changed, try again", str(path)) from error
-
-
-def _loaded(path: Path) -> dict[str, Any]:
     file = path.read_bytes()
     try:
         with zipfile.ZipFile(io.BytesIO(file)) as archive:
             if (wrong := archive.testzip()) is not None:
-                raise DamagedFileError(f"{path} is damaged: {wrong} does not have the checksum it was written with.")
+                raise ValueError(f"{wrong} does not have the checksum it was written with")
         content = torch.load(io.BytesIO(file), weights_only=True, map_location="cpu")
-    except (MemoryError, DamagedFileError):
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds a {type(content).__name__}")
+    except MemoryError:
         raise
-    except pickle.UnpicklingError as error:
-        raise DamagedFileError(
-            f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
-            f"in plain containers. {first_line(error)}"
-        ) from error
-    except Exception as error:  # of many kinds
-        if "allocate memory" in str(error):  # torch has no class of its own for it on the CPU
-            raise MemoryError from error
-        raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
-    if not isinstance(content, dict):
-        raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
+    except Exception as error:  # of many kinds; torch adds advice after the first line, such as to run the code in it
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{path} is damaged, or no file of a run of this version: {reason}.") from error
     return content
-
-
-def first_line(error: Exception) -> str:
-    """First line of an error's message, without the advice that torch adds after it."""
-    return f"({(str(error).splitlines() or [type(error).__name__])[0]})"
 
 
 def plain(value: Any, place: str = "") -> Any:
@@ -93,17 +66,15 @@ def plain(value: Any, place: str = "") -> Any:
     """
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().as_subclass(torch.Tensor)
-    value = value.item() if isinstance(value, np.generic) else value
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):  # also one of a derived class
-            return kind(value)
-    if value is None:
-        return None
+    if isinstance(value, np.generic):
+        return value.item()
     if isinstance(value, Mapping):
         return {key: plain(entry, f"{place}[{key!r}]") for key, entry in value.items()}
-    if type(value) in (list, tuple, torch.Size):
+    if isinstance(value, list | tuple):
         entries = [plain(entry, f"{place}[{k}]") for k, entry in enumerate(value)]
         return entries if isinstance(value, list) else tuple(entries)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
     raise ValueError(
         f"{place or 'content'} of what is to be saved is a {type(value).__name__}; a state_dict may hold tensors, "
         "numbers and strings, in dicts, lists and tuples."
@@ -112,13 +83,11 @@ def plain(value: Any, place: str = "") -> Any:
 
 FORMAT = 7
 KEPT = 3
-"""Number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before."""
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a full disk and of a used quota."""
+"""Number of latest checkpoints that are kept."""
 ANEW = "To train anew, choose another folder."
 
 
-def save_checkpoint(folder: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> str | None:
+def save_checkpoint(folder: Path, algorithm: "ReinforcementTwinning", episodes: list[dict[str, Any]]) -> None:
     """Write a checkpoint, whose name has the number of episodes; earlier ones stay until it is complete.
 
     Args:
@@ -126,101 +95,55 @@ def save_checkpoint(folder: Path, algorithm: "ReinforcementTwinning", episodes: 
         algorithm: algorithm to save.
         episodes: records of the episodes that are done.
 
-    Returns:
-        None; or, if the disk is full and earlier checkpoints had to go to make room, a sentence that says so.
-
     Raises:
         ValueError: if a component's state, such as an environment's, holds more than tensors, numbers and strings.
         OSError: if the checkpoint cannot be written.
     """
-    content = {
-        "format": FORMAT,
-        "episodes": episodes,
-        "state": {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()},
-    }
-    path, older = folder / f"checkpoint-{len(episodes):04d}.pt", checkpoints(folder)[1:]
-    try:
-        save_tensors(path, content)
-    except OSError as error:
-        if error.errno not in FULL or not older:
-            raise
-        for old in older:
-            old.unlink(missing_ok=True)
-        save_tensors(path, content)
-        return f"the disk of {folder} is full; {len(older)} earlier checkpoints went to save the present one"
+    state = {"plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()}
+    content = {"format": FORMAT, "episodes": episodes, "state": state}
+    save_tensors(folder / f"checkpoint-{len(episodes):04d}.pt", content)
     for old in checkpoints(folder)[KEPT:]:
         old.unlink(missing_ok=True)
-    return None
 
 
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a run, latest first."""
-    numerals = {file: file.stem.removeprefix("checkpoint-") for file in folder.glob("checkpoint-*.pt")}
-    numbers = {file: int(number) for file, number in numerals.items() if number.isdecimal()}
-    return sorted(numbers, key=numbers.__getitem__, reverse=True)
+    return sorted(folder.glob("checkpoint-[0-9]*.pt"), key=lambda file: (len(file.name), file.name), reverse=True)
 
 
 def load_checkpoint(folder: Path, algorithm: "ReinforcementTwinning") -> list[dict[str, Any]]:
-    """Restore the newest checkpoint that is sound, and return the records of its episodes.
+    """Put an algorithm into the state of the newest checkpoint, and return the records of its episodes.
 
-    If that is not the newest of all, a line on the terminal says so, and the damaged files are renamed.
+    Args:
+        folder: run folder.
+        algorithm: algorithm that was built with the same configuration.
 
     Raises:
-        ValueError: if there is no checkpoint, all of them are damaged, or the newest sound one has another format,
-            belongs to another plant, or does not fit.
-        OSError: if a checkpoint cannot be read, which does not make it a damaged one; nothing is renamed.
+        ValueError: if there is no checkpoint, or the newest is damaged, has another format, belongs to another plant,
+            or does not fit.
     """
-    damaged: dict[Path, DamagedFileError] = {}
-    for file in checkpoints(folder):
-        try:
-            checkpoint = _read(file)
-        except DamagedFileError as error:
-            damaged[file] = error
-            continue
-        try:
-            _restore(file, checkpoint, algorithm)
-        except ValueError as error:
-            raise ValueError(f"{error} {ANEW}") from error
-        _set_aside(damaged, file, len(checkpoint["episodes"]))
-        return checkpoint["episodes"]
-    reasons = " ".join(map(str, damaged.values())) or f"{folder} holds no checkpoint to go on from."
-    raise ValueError(f"{reasons} {ANEW}")
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """The content of a checkpoint of any format."""
-    checkpoint = load_tensors(file)
-    if not {"format", "episodes", "state"} <= checkpoint.keys():
-        raise DamagedFileError(
-            f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, checkpoint)) or 'nothing'}."
-        )
-    return checkpoint
-
-
-def _restore(file: Path, checkpoint: dict[str, Any], algorithm: "ReinforcementTwinning") -> None:
-    """Put an algorithm that was built with the same configuration into the state of a checkpoint."""
-    if checkpoint["format"] != FORMAT:
-        raise ValueError(f"{file} has checkpoint format {checkpoint['format']}; this version reads format {FORMAT}.")
-    name, state = algorithm.twin.plant.name, checkpoint["state"]
-    if state.get("plant") != name:
+    file = next(iter(checkpoints(folder)), None)
+    if file is None:
+        raise ValueError(f"{folder} holds no checkpoint to go on from. {ANEW}")
+    try:
+        checkpoint = load_tensors(file)
+    except ValueError as error:
+        raise ValueError(f"{error} Remove it to go on from the checkpoint before it. {ANEW}") from error
+    if checkpoint.get("format") != FORMAT:
         raise ValueError(
-            f"the checkpoint is of plant {state.get('plant')!r}, this training of {name!r}; use its recipe."
+            f"{file} has checkpoint format {checkpoint.get('format')}; this version reads format {FORMAT}. {ANEW}"
         )
+    name, state = algorithm.twin.plant.name, checkpoint["state"]
+    if state["plant"] != name:
+        raise ValueError(f"{file} is of plant {state['plant']!r}, this training of {name!r}; use its recipe. {ANEW}")
     try:
         algorithm.load_state_dict(state["algorithm"])
     except (KeyError, ValueError) as error:
         raise ValueError(
-            f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
-            f"with (see its config.json). {type(error).__name__}: {error}"
+            f"the weights of {file} do not fit this training of {name!r}; start with the options it was started "
+            f"with (see its config.json). {type(error).__name__}: {error} {ANEW}"
         ) from error
-
-
-def _set_aside(damaged: dict[Path, DamagedFileError], sound: Path, episodes: int) -> None:
-    """Say which checkpoint was taken in the place of damaged ones, and keep these under another name."""
-    for file, error in damaged.items():
-        aside = file.with_name(f"{file.name}.damaged")
-        file.replace(aside)
-        print(f"{error} It is now {aside.name}; the training goes on from {sound.name}, after {episodes} episodes.")
+    return checkpoint["episodes"]
 
 
 RESULTS = ("metrics.json", "weights.pt")
@@ -245,7 +168,9 @@ class RunFolder:
 
     def __init__(self, config: RunConfig, plant: str, controllers: Mapping[str, Any] | None = None):
         self._config, self._plant, self._controllers = config, plant, controllers or {}
-        self.path = self._make_path()
+        parent = Path("runs") / plant
+        make_folder("log_dir", config.log_dir or parent)
+        self.path = config.log_dir or new_folder(parent, f"-seed-{config.seed}")
         # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
         self.hold()
@@ -254,11 +179,6 @@ class RunFolder:
         except BaseException:
             self.release()
             raise
-
-    def _make_path(self) -> Path:
-        parent = Path("runs") / self._plant
-        make_folder("log_dir", self._config.log_dir or parent)
-        return self._config.log_dir or new_folder(parent, f"-seed-{self._config.seed}")
 
     def hold(self) -> None:
         """Keep other trainings out of the folder from now on.
@@ -270,44 +190,34 @@ class RunFolder:
             return
         try:
             self._lock.acquire(timeout=0)
-        except filelock.Timeout as error:
+        except (filelock.Timeout, OSError) as error:
             raise ValueError(
-                f"log_dir={self.path} is in use by another training; wait for its end, or choose another folder."
+                f"log_dir={self.path} is in use by another training, or cannot be locked ({error}); wait for its end, "
+                "or choose another folder."
             ) from error
-        except OSError as error:
-            raise ValueError(f"log_dir={self.path} cannot be locked ({error}); choose another folder.") from error
-        remove_partials(self.path)
-        remove_partials(self.path / "figures")
+        for folder in (self.path, self.path / "figures"):
+            remove_partials(folder)
 
     def release(self) -> None:
         """Let other trainings use the folder."""
         self._lock.release(force=True)
 
     def _require_consistent(self) -> None:
+        holds_run = (self.path / FILE).is_file()
+        finished = any((self.path / name).exists() for name in RESULTS)
         if not self._config.resume:
-            if checkpoints(self.path) or any((self.path / name).exists() for name in RESULTS):
+            if checkpoints(self.path) or finished:
                 raise ValueError(f"log_dir={self.path} holds a run already; --resume it, or choose another folder.")
-            if self.holds_run():
+            if holds_run:
                 read_settings(self.path)  # which refuses a file of somebody else that would be overwritten
             return
-        if not self.holds_run():
-            raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
+        if not holds_run or (finished and not checkpoints(self.path)):
+            raise ValueError(f"log_dir={self.path} holds no run to resume: it needs {FILE} and a checkpoint. {ANEW}")
         require_same(self.path, self._config, self._controllers)
-        if not checkpoints(self.path) and any((self.path / name).exists() for name in RESULTS):
-            raise ValueError(
-                f"log_dir={self.path} holds a finished run without a checkpoint: there is nothing to go on with. {ANEW}"
-            )
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        resumable = bool(checkpoints(self.path))
-        if self._config.resume and not resumable:
-            print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
-        return self._config.resume and resumable
-
-    def holds_run(self) -> bool:
-        """Whether the folder holds a run: its options are written when it begins."""
-        return (self.path / FILE).is_file()
+        return self._config.resume and bool(checkpoints(self.path))
 
     def begin(self, effective: RunConfig) -> None:
         """Write ``config.json``.
