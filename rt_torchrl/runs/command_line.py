@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
@@ -24,13 +24,9 @@ from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.console import HELP, PACKAGE
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, FILE, OF_THE_CALL, as_written, module_of, named
+from rt_torchrl.runs.settings import BESIDE, FILE, OF_THE_CALL, as_written, module_of, named, require_config
 
 Configuration = TypeVar("Configuration")
-
-
-NOISY = ("torchrl", "torch.utils.cpp_extension")
-"""Loggers that report the inner work of a library."""
 
 
 SOURCES = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
@@ -40,7 +36,7 @@ SOURCES = (PACKAGE, PACKAGE.parent / "envs", PACKAGE.parent / "recipes")
 def quieten_libraries() -> None:
     """Keep log lines and warnings off the terminal that concern the libraries' own code, which a user cannot mend."""
     os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")  # TorchRL sets its own level when it is loaded, which is later
-    for name in NOISY:
+    for name in ("torchrl", "torch.utils.cpp_extension"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
 
@@ -81,7 +77,6 @@ def _is_for_users(error: Exception) -> bool:
 
 HELP_ALL = "--help-all"
 """Word that asks for help on all options, not on those of the recipe and its run alone."""
-MORE = f"{HELP_ALL} also lists the options whose names have dots, such as the parameters of the six steps."
 
 
 def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:
@@ -89,51 +84,43 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
 
     The command line of a recipe is read twice, because the defaults of some options depend on other options; see
     :meth:`RunConfig.defaults`. Those of a run that goes on are its own options. Options that are given stay as they
-    are. The help shows the defaults that hold beside the options that are given.
+    are.
 
     Args:
         config_class: class of the configuration.
         arguments: words of the command line; by default those of this process.
     """
-    words = sys.argv[1:] if arguments is None else arguments
-    rest = [word for word in words if word not in (*HELP, HELP_ALL)]
-    helped = len(rest) < len(words)
-    if issubclass(config_class, RunConfig):
-        # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
-        default = cast(Configuration, _defaults(config_class, rest, helped=helped))
-    else:
-        default = tyro.MISSING_NONPROP
-    if not helped:
-        config = tyro.cli(config_class, args=rest, default=default)
-        # The file has been read now.
-        return dataclasses.replace(config, config=None) if isinstance(config, RunConfig) else config
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if {HELP_ALL, *HELP} & set(words):
+        _show_help(config_class, everything=HELP_ALL in words)
+    if not issubclass(config_class, RunConfig):
+        return tyro.cli(config_class, args=words)
+    asked = tyro.cli(config_class, args=words)
+    resumed = asked.log_dir / FILE if asked.resume and asked.log_dir is not None else None
+    file = asked.config or (resumed if resumed is not None and resumed.is_file() else None)
+    default = asked.defaults() if file is None else of_file(file, asked)
+    # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
+    config = tyro.cli(config_class, args=words, default=cast(Configuration, default))
+    # The file has been read now.
+    return dataclasses.replace(config, config=None) if isinstance(config, RunConfig) else config
+
+
+def _show_help(config_class: type, *, everything: bool) -> NoReturn:
+    """Show the options, those of the parts of a configuration only if everything is asked for, and leave."""
     registry = ConstructorRegistry()
 
     @registry.struct_rule
     def hidden(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if HELP_ALL in words or info.type is config_class or not dataclasses.is_dataclass(info.type):
+        if everything or info.type is config_class or not dataclasses.is_dataclass(info.type):
             return None
         return StructConstructorSpec(instantiate=lambda: info.default, fields=())
 
+    default = config_class().defaults() if issubclass(config_class, RunConfig) else tyro.MISSING_NONPROP
     with contextlib.suppress(SystemExit):
         tyro.cli(config_class, args=["--help"], default=default, registry=registry)
-    if HELP_ALL not in words:
-        print(MORE)
+    if not everything:
+        print(f"{HELP_ALL} also lists the options whose names have dots, such as the parameters of the six steps.")
     raise SystemExit(0)
-
-
-def _defaults(config_class: type[RunConfig], words: Sequence[str], *, helped: bool) -> RunConfig:
-    """The defaults of all options beside those that are given, with which help is asked for or not."""
-    try:
-        config = tyro.cli(config_class, args=words, console_outputs=not helped)
-        settings = None if config.log_dir is None else config.log_dir / FILE
-        resumed = settings if config.resume and settings and settings.is_file() else None
-        file = config.config or resumed
-        return config.defaults() if file is None else of_file(file, config)
-    except (SystemExit, ValueError, OSError):
-        if helped:  # beside words that cannot be carried out, too
-            return config_class().defaults()
-        raise
 
 
 def of_file(path: Path, config: RunConfig) -> RunConfig:
@@ -146,13 +133,11 @@ def of_file(path: Path, config: RunConfig) -> RunConfig:
             value that it does not take.
     """
     settings = read_json(path)
-    recipe: Any = {} if settings.get("recipe") is None else settings["recipe"]
-    source = recipe.get("file") if isinstance(recipe, dict) else 0
-    if not isinstance(source, str | None):
-        raise ValueError(f"{path}: its recipe is {recipe!r}; it must be an object, as in config.json of a run.")
+    recipe = settings.get("recipe")
+    source = recipe.get("file") if isinstance(recipe, dict) else None
     file = getattr(sys.modules[type(config).__module__], "__file__", None)
-    if source and file and Path(source).name != Path(file).name:
-        raise ValueError(f"{path} is of the recipe {Path(source).name}, not of {Path(file).name}; use its recipe.")
+    if source and file and Path(str(source)).name != Path(file).name:
+        raise ValueError(f"{path} is of the recipe {Path(str(source)).name}, not of {Path(file).name}; use its recipe.")
     options = {name: value for name, value in settings.items() if name not in (*BESIDE, *OF_THE_CALL)}
     try:
         stored = read_options(type(config), _over(as_written(config.defaults()), options))
@@ -177,12 +162,8 @@ def load_recipe(path: Path) -> ModuleType:
     Raises:
         ValueError: if there is no such file, or it lacks a ``Config`` derived from ``RunConfig`` or a ``main``.
     """
-    if not path.is_file():
-        raise ValueError(f"recipe={path} does not exist; give the file of a recipe.")
     module = module_of(path)
-    config_class = getattr(module, "Config", None)
-    if not (isinstance(config_class, type) and issubclass(config_class, RunConfig)):
-        raise ValueError(f"recipe={path} has no class Config derived from RunConfig.")
+    require_config(getattr(module, "Config", None), f"Config of recipe={path}")
     if not callable(getattr(module, "main", None)):
         raise ValueError(f"recipe={path} has no function main that takes its Config.")
     return module

@@ -10,8 +10,6 @@ from pathlib import Path
 PROGRAM = "rt-torchrl"
 PACKAGE = Path(__file__).resolve().parent.parent
 HELP = ("-h", "--help")
-FIRST = "wind_turbine flapping_wing cryogenic_tank cascaded_tanks pendulum reactor drive double_pendulum".split()
-"""Recipes that train on a plant; the list begins with them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,18 +54,12 @@ def recipe(name: str) -> Path:
     Raises:
         SystemExit: if there is none.
     """
-    if name.endswith(".py"):
-        path = Path(name)
-        if not path.is_file():
-            raise SystemExit(f"error: {name} does not exist; give the file of a recipe, or a name: {PROGRAM} --help.")
-        return path.resolve()
-    known = recipes()
-    file = known.get(name.replace("-", "_"))
-    if file is None:
-        near = difflib.get_close_matches(name, known, n=1)
+    path = Path(name) if name.endswith(".py") else recipes().get(name.replace("-", "_"))
+    if path is None or not path.is_file():
+        near = difflib.get_close_matches(name, recipes(), n=1)
         meant = f"did you mean {near[0]}? " if near else ""
         raise SystemExit(f"error: there is no recipe {name!r}; {meant}{PROGRAM} --help lists them all.")
-    return file
+    return path.resolve()
 
 
 def call_of(name: str) -> str:
@@ -77,15 +69,12 @@ def call_of(name: str) -> str:
 
 def listing() -> str:
     """The recipes with what each one is for."""
-    known = recipes()
-    names = sorted(known, key=lambda name: name not in FIRST)
-    width = max(map(len, names), default=0)
     return "\n".join(
         [
             f"usage: {PROGRAM} RECIPE [OPTIONS]",
             "",
-            *(f"  {name:{width}}  {purpose(known[name])}" for name in names),
-            f"  {'FILE.py':{width}}  A recipe of your own.",
+            *(f"  {name:18}  {purpose(path)}" for name, path in recipes().items()),
+            f"  {'FILE.py':18}  A recipe of your own.",
             "",
             f"{PROGRAM} RECIPE --help lists the options of a recipe.",
             f"A first run: {PROGRAM} wind_turbine --quick",

@@ -32,8 +32,6 @@ CONTROLLERS = "controllers"
 """Key of the numbers of the classical controllers, by their names."""
 BESIDE = ("plant", "recipe", CONTROLLERS, RAN)
 """Keys of ``config.json`` that are not options."""
-OWN_CLASS: dict[str, str | None] = {"class": "RunConfig", "file": None}
-"""What a run with the configuration of this library itself names in the place of a recipe."""
 OF_EVERY_RUN = frozenset(option.name for option in dataclasses.fields(RunConfig))
 GIVE = "give the recipe: its file, or in code the class itself"
 
@@ -86,7 +84,7 @@ def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
     """
     origin: Any = settings.get("recipe")
     place = folder / FILE
-    if origin == OWN_CLASS:
+    if origin == _origin(RunConfig):
         return RunConfig
     try:
         name, path = str(origin["class"]), Path(origin["file"])
@@ -116,20 +114,18 @@ def require_config(config_class: Any, name: str) -> type[RunConfig]:
 
 
 def _origin(config_class: type) -> dict[str, str | None]:
-    if config_class is RunConfig:
-        return OWN_CLASS
+    """Name and file of a recipe's class; no file for the class of this library, and in an interactive session."""
     file = getattr(sys.modules.get(config_class.__module__), "__file__", None)
-    return {"class": config_class.__qualname__, "file": str(Path(file).resolve()) if file else None}
+    known = None if config_class is RunConfig or file is None else str(Path(file).resolve())
+    return {"class": config_class.__qualname__, "file": known}
 
 
-VERSIONS_OF = ("torch", "torchrl", "tensordict")
 OF_THE_CALL = ("config", "log_dir", "resume")
 """Options that a file of options never gives."""
 BESIDE_TRAINING = {"figures", "reference", "threads", *OF_THE_CALL}
 """Options of the place, the reports and the speed of a run, under which it trains and costs the same."""
 HARMLESS = {*BESIDE_TRAINING, "episodes", "unseen_every", "real_unseen"}
 """Options that may differ when a run is resumed: these and those of its length."""
-ABSENT = "nothing"
 
 
 def numbers_of(law: nn.Module) -> dict[str, Any]:
@@ -160,21 +156,16 @@ def write_settings(
         OSError: if the file cannot be written.
     """
     before = read_settings(folder).get(RAN, []) if config.resume else []
+    versions = {name: importlib.metadata.version(name) for name in ("torch", "torchrl", "tensordict")}
     ran = {
         "effective": as_written(effective),
-        "versions": versions(),
+        "versions": {"python": platform.python_version(), "rt_torchrl": rt_torchrl.__version__} | versions,
         "command": shlex.join(sys.argv),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     settings = settings_of(config, plant) | {CONTROLLERS: controllers, RAN: [*before, ran]}
     # Options may be infinite; JSON as Python writes it keeps them as they are.
     write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, this library and the libraries it computes with."""
-    versions = {"python": platform.python_version(), "rt_torchrl": rt_torchrl.__version__}
-    return versions | {name: importlib.metadata.version(name) for name in VERSIONS_OF}
 
 
 def as_written(config: RunConfig) -> dict[str, Any]:
@@ -200,8 +191,8 @@ def require_same(folder: Path, config: RunConfig, controllers: Mapping[str, Any]
             f"Its flights tell nothing of this one: give it what it was in the run, or begin a new run by --start "
             f"{folder}, which takes policies and twin of the run, when it is finished, without its flights."
         )
-    judged = settings.get("unseen_every")
-    if changed := differences(folder, config, HARMLESS if judged else HARMLESS | {"unseen"}):
+    harmless = HARMLESS if settings.get("unseen_every") else HARMLESS | {"unseen"}
+    if changed := differences(folder, config, harmless):
         raise ValueError(
             f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(changed)}. Give the run's "
             "own options, or another folder for a new run."
@@ -225,7 +216,7 @@ def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str] = HA
 def changes(earlier: Mapping[str, Any], present: Mapping[str, Any], but: AbstractSet[str] = frozenset()) -> list[str]:
     """What differs between the settings of a run and the present ones, in words, except for some names."""
     was, now = (flat({k: v for k, v in settings.items() if k not in but}) for settings in (earlier, present))
-    pairs = [(name, now.get(name, ABSENT), was.get(name, ABSENT)) for name in sorted(was.keys() | now.keys())]
+    pairs = [(name, now.get(name, "nothing"), was.get(name, "nothing")) for name in sorted(was.keys() | now.keys())]
     return [f"{name} is {new} here and was {old} in the run" for name, new, old in pairs if new != old]
 
 
@@ -238,10 +229,6 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             options[prefix + name] = value
     return options
-
-
-PREFIX = "rt_torchrl_recipe_"
-"""Prefix of the names under which files are imported."""
 
 
 def module_of(file: Path) -> ModuleType:
@@ -259,13 +246,9 @@ def module_of(file: Path) -> ModuleType:
         place = getattr(loaded, "__file__", None)
         if place and Path(place).name == file.name and Path(place).resolve() == file:
             return loaded
-    return _imported(file)
-
-
-def _imported(file: Path) -> ModuleType:
     if str(file.parent) not in sys.path:
         sys.path.insert(0, str(file.parent))
-    name = f"{PREFIX}{file.stem}"
+    name = f"rt_torchrl_recipe_{file.stem}"
     while name in sys.modules:  # a file of the same name in another folder
         name += "_"
     spec = importlib.util.spec_from_file_location(name, file)
