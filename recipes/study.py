@@ -121,6 +121,8 @@ class Config:
                 config = trainings[system, arm][0].config()  # a mistake ends it here and not in every training
                 if isinstance(config, MakesPlant):
                     config.plant()
+                if task_of(as_written(config)) != task_of(as_written(trainings[system, next(iter(arms))][0].config())):
+                    raise ValueError(f"arm {arm!r} of {system!r} is of another task; make it a system of its own.")
         return trainings
 
     def search(self, training: "Training") -> "Search":

@@ -101,22 +101,6 @@ def test_checks_that_are_printed_are_what_ci_runs():
     script = [line.removesuffix(" &") for line in (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()]
     assert {MYPY, BUILD} <= set(script)
     assert any(line.startswith(f"{PYTEST} -n 2 --dist loadfile") for line in script)
-    rest = [command for command in commands() if command not in OF_A_RECIPE]
-    known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
-    known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
-    known |= {"uv run tests/ruler.py", "uv run tests/ruler.py --seeds 5"}  # an hour
-    known |= {"uv run --group nightly tests/fast_gradients.py"}  # tests/test_benchmark.py
-    known |= {"uv run --group nightly tests/learners.py"}  # half an hour
-    known |= {
-        command
-        for command in rest
-        if re.fullmatch(r"uv run --group nightly tests/peers\.py \w+( --[a-z]+ \d+)*", command)
-    }
-    known |= {command for command in rest if command.startswith("uv run --extra rosco tests/rosco_peer.py ")}  # an hour
-    known |= {"uv run docs/gallery.py"}  # tests/test_documentation.py
-    known |= {f"{PYTEST} -m machine -s"}  # for a quiet machine
-    known |= {f"{PYTEST} -m faults"}
-    assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
 
 

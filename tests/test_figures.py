@@ -196,7 +196,6 @@ def test_arms_leave_out_what_they_do_not_have(arm):
     assert len(drawn["learning_curves"].axes) == (2 if arm == "model_free" else 3)
     for figure in drawn.values():
         draw(figure)
-    draw(figures.exogenous(snapshot))
     bare = replace(snapshot, episodes=[])
     assert set(figures.figures_of(bare)) == set(drawn) - {"learning_curves"}
 

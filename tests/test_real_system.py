@@ -168,7 +168,7 @@ def test_a_real_controller_is_refused_where_policies_are_judged_in_simulation(si
     plant = LinearQuadratic(horizon=2.0)
     env = None if simulated else connected(plant, closure=plant.closure)
     config = RunConfig(log_dir=tmp_path / "run")
-    with pytest.raises(ValueError, match=r"baselines \['machine'\] can only be flown on a real system"):
+    with pytest.raises(ValueError, match=r"baselines \['machine'\] can only be flown on the real system"):
         Run(config, plant, env=env, baselines={"machine": RealController})
     assert not (tmp_path / "run").exists()
 

@@ -108,7 +108,7 @@ def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believ
     options = believing[1] | {"log_dir": tmp_path}
     which = [dataclasses.replace(SMALL, hypotheses=HypothesesConfig(which=(name,))) for name in ("late", "none")]
     late, alone = (RunConfig(**options | {"twinning": twinning}) for twinning in which)
-    with pytest.raises(ValueError, match=r"believes 'lags', but hypotheses 'lags' .*which of that run, or"):
+    with pytest.raises(ValueError, match=r"believes 'lags', but hypotheses 'lags' .*which of that run, or none"):
         Run(late, Suspecting(horizon=4.0))
     assert not isinstance(Run(alone, Suspecting(horizon=4.0)).algorithm.twin, TwinEnsemble)
 
@@ -118,7 +118,7 @@ def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
     for changed, options, message in (
         ({"name": "other"}, {}, "is a run of plant 'linear_quadratic', this run is of plant 'other'"),
         ({"observations": speed}, {}, "whose observations are .*velocity_error"),
-        ({}, {"closure": "mlp"}, r"does not fit the LinearClosure of this run"),
+        ({}, {"closure": "mlp"}, r"whose closure does not fit that of this run"),
     ):
         plant = type("Other", (LinearQuadratic,), changed)(horizon=2.0, noise=0.1)
         with pytest.raises(ValueError, match=message):

@@ -125,10 +125,8 @@ def caption(ax: Axes, label: str, note: str = "") -> None:
 def legend_above(ax: Axes) -> None:
     """Draw a legend above the panel on the right, clear of its curves."""
     entries = _entries([ax])
-    if not entries:
-        return
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0, "borderpad": 0.1}
-    ax.legend(list(entries.values()), list(entries), ncols=len(entries), fontsize=9, frameon=False, **place)
+    ax.legend(list(entries.values()), list(entries), ncols=max(1, len(entries)), fontsize=9, frameon=False, **place)
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
@@ -158,20 +156,14 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
         ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
 
 
-def fit_for_logarithms(ax: Axes, least_range: float) -> bool:
-    """Whether all finite values of the panel's lines are positive, and the greatest is this many times the least."""
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
-    values = values[np.isfinite(values)]
-    return values.size > 0 and values.min() > 0.0 and values.max() >= least_range * values.min()
-
-
 def logarithmic_if_wide(ax: Axes, least_range: float = WIDE_RANGE) -> None:
     """Make an axis logarithmic whose values are positive and lie far apart."""
-    if not fit_for_logarithms(ax, least_range):
-        return
-    ax.set_yscale("log")
-    if not fit_for_logarithms(ax, 1000.0):
-        plain_numbers(ax)
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+    values = values[np.isfinite(values)]
+    if values.size and values.min() > 0.0 and values.max() >= least_range * values.min():
+        ax.set_yscale("log")
+        if values.max() < 1000.0 * values.min():
+            plain_numbers(ax)
 
 
 def plain_numbers(ax: Axes) -> None:

@@ -88,31 +88,21 @@ def states(snapshot: Snapshot) -> Figure:
 def exogenous(snapshot: Snapshot) -> Figure:
     """Each input that acts on the plant as recorded, with its large scale, and below it samples of other possible ones.
 
-    Each input has a column. In an arm that trains no twin the figure shows the record alone.
+    Each input has a column.
     """
+    assert snapshot.large_scale is not None and snapshot.realisations is not None
     signals, recorded = snapshot.plant.acting_inputs, array(snapshot.record.exogenous)
-    columns, rows = len(signals), 1 if snapshot.large_scale is None else 2
-    figure, axes, time = style.timeline(
-        snapshot.plant,
-        len(recorded),
-        rows * columns,
-        columns,
-        title=f"Exogenous input, {style.episode(snapshot)}",
-        size=(max(7.5, 5.0 * columns), 0.9 + 2.4 * rows),
-        sharey="col",
-    )
-    time = time[:-1]
+    mean, samples, columns = array(snapshot.large_scale), array(snapshot.realisations[:3]), len(signals)
+    title, size = f"Exogenous input, {style.episode(snapshot)}", (max(7.5, 5.0 * columns), 5.7)
+    of_grid: dict[str, Any] = {"title": title, "size": size, "sharey": "col"}
+    figure, axes, time = style.timeline(snapshot.plant, len(recorded), 2 * columns, columns, **of_grid)
     for k, signal in enumerate(signals):
-        above, *below = axes[k::columns]
-        above.plot(time, recorded[:, k], color=REAL, linewidth=1.0, label="recorded")
-        if snapshot.large_scale is not None and snapshot.realisations is not None:
-            samples, mean = array(snapshot.realisations[:3]), array(snapshot.large_scale)
-            for sample in samples:
-                below[0].plot(time, sample[:, k], color=style.SAMPLES, linewidth=0.8, label="_")
-            below[0].lines[0].set_label(f"{len(samples)} samples")
-            for ax in (above, *below):
-                ax.plot(time, mean[:, k], color=style.LARGE_SCALE, linewidth=2.2, label="large scale (SVR)")
-        for ax in (above, *below):
+        above, below = axes[k::columns]
+        above.plot(time[:-1], recorded[:, k], color=REAL, linewidth=1.0, label="recorded")
+        for sample, label in zip(samples, (f"{len(samples)} samples", "_", "_"), strict=True):
+            below.plot(time[:-1], sample[:, k], color=style.SAMPLES, linewidth=0.8, label=label)
+        for ax in (above, below):
+            ax.plot(time[:-1], mean[:, k], color=style.LARGE_SCALE, linewidth=2.2, label="large scale (SVR)")
             caption(ax, signal.label)
     legend_below(figure, axes[::columns])
     return figure
@@ -173,7 +163,9 @@ def closure_weights(snapshot: Snapshot) -> Figure:
         if name in true:
             ax.axhline(true[name], label="true", **style.REFERENCE_LINE)
         style.logarithmic_if_wide(ax)
-        label = _label(name, described.get(name, {}))
+        about = described.get(name, {"unit": "-", "meaning": ""})
+        words = name.replace("_", " ") + ("" if about["unit"] == "-" else f" [{about['unit']}]")
+        label = "\n".join([words, *textwrap.wrap(about["meaning"], 44)])
         caption(ax, label, f"{100.0 * (values[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_xlim(0.5, len(snapshot.episodes) + 0.5)
@@ -181,18 +173,8 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     return figure
 
 
-def _label(name: str, about: Mapping[str, str]) -> str:
-    """The label of a panel: the name of a weight, with its unit if there is one, and below it what it means."""
-    unit, meaning = about.get("unit"), about.get("meaning", "")
-    words = name.replace("_", " ") + ("" if unit in (None, "-") else f" [{unit}]")
-    return "\n".join([words, *textwrap.wrap(meaning, 44)])
-
-
 def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:
-    """Coefficients that episodes report as a number with a name; nan in an episode that does not report them.
-
-    There are none in runs that are older than the key ``closure``, nor for a closure whose weights have no names.
-    """
+    """Coefficients that episodes report as a number with a name; nan in an episode that does not report them."""
     reported = [_numbers(episode.get("closure")) for episode in episodes]
     return {name: _column(reported, name) for name in dict.fromkeys(name for weights in reported for name in weights)}
 
@@ -253,7 +235,9 @@ def _curves(snapshot: Snapshot) -> Figure:
         size=(6.5, 1.2 + 2.4 * len(plant.actions)),
         xlabel=plant.observations[0].label,
     )
-    for role in functions_of_observation(snapshot):
+    for role in ROLES:
+        if isinstance(snapshot.policies[role], StateFeedback):
+            continue
         values = array(snapshot.policies[role](axis[:, None]))
         for k, ax in enumerate(axes):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
@@ -310,8 +294,10 @@ def contours(
     for plane, grid in grids.items():
         points = others.expand(RESOLUTION**2, -1).clone()
         points[:, plane] = torch.cartesian_prod(*grid)
-        for role in functions_of_observation(snapshot):
-            fields[plane, role] = array(snapshot.policies[role](points)[:, action]).reshape(RESOLUTION, RESOLUTION)
+        for role in ROLES:
+            if not isinstance(snapshot.policies[role], StateFeedback):
+                values = array(snapshot.policies[role](points)[:, action])
+                fields[plane, role] = values.reshape(RESOLUTION, RESOLUTION)
     levels = _levels(list(fields.values()))
     for plane, pair in planes.items():
         for role, ax in zip(ROLES, pair, strict=True):
@@ -328,11 +314,6 @@ def contours(
         pair[0].set_ylabel(signals[plane[1]].label)
     axes = [ax for pair in planes.values() for ax in pair]
     axes[0].figure.colorbar(filled, ax=axes, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
-
-
-def functions_of_observation(snapshot: Snapshot) -> list[Role]:
-    """Roles whose policies can be drawn over observations."""
-    return [role for role in ROLES if not isinstance(snapshot.policies[role], StateFeedback)]
 
 
 def _some(visited: Tensor) -> Tensor:
@@ -353,7 +334,6 @@ def _axis(signal: Signal, visited: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
 
 
 def _levels(fields: list[Float[np.ndarray, "m m"]]) -> Float[np.ndarray, " levels"]:
-    """Round levels that include all values of the policies; a constant policy has levels around its value."""
+    """Round levels that include all values of the policies."""
     low, high = min(field.min() for field in fields), max(field.max() for field in fields)
-    margin = max(1e-6 * max(abs(low), abs(high)), 1e-12) if high - low < 1e-9 * max(abs(low), abs(high), 1e-3) else 0.0
-    return np.asarray(MaxNLocator(12).tick_values(low - margin, high + margin))
+    return np.asarray(MaxNLocator(12).tick_values(low, high))

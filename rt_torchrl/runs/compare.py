@@ -23,7 +23,6 @@ NEAR = 0.1
 EXCLUDED = {*BESIDE, *BESIDE_TRAINING, "seed"}
 """Settings in which the runs of one row may differ."""
 COLOURS = ("#222222", "#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
-MARKERS = "os^DvP*X"
 DASHES = ("--", ":", "-.", (0, (1, 1)))
 
 
@@ -70,11 +69,6 @@ class FinishedRun:
         """J_a of the policy that was live at the end, mean over the unseen episodes."""
         return statistics.fmean(self.costs)
 
-    @property
-    def task(self) -> dict[str, Any]:
-        """The options that make plant, inputs and cost."""
-        return task_of(self.settings)
-
     @classmethod
     def read(cls, folder: Path) -> "FinishedRun":
         """The run in a folder.
@@ -83,13 +77,13 @@ class FinishedRun:
             ValueError: if the folder holds no finished run, its results are damaged, or it was judged on its own twin
                 alone.
         """
-        settings, metrics = read_settings(folder), read_metrics(folder)
+        metrics = read_metrics(folder)
         summary, episodes = metrics["summary"], metrics["episodes"]
-        unseen, live = judged_on_the_system(summary)
+        unseen, live = judged_on_the_system(summary), summary["live"]
         judged = all("J_a_unseen" in episode for episode in episodes)
         return cls(
             folder=folder,
-            settings=settings,
+            settings=read_settings(folder),
             place="real system" if on_the_twin(summary["unseen"]) else "simulation",
             live=live,
             costs=_numbers(unseen["costs"][live]),
@@ -131,13 +125,6 @@ class Row:
         return {run.seed: sum(run.real) for run in self.runs}
 
     @property
-    def regret(self) -> list[float] | None:
-        """What each run has paid beyond as many episodes of the optimum."""
-        if self.optimum is None:
-            return None
-        return [sum(run.real) - len(run.real) * self.optimum for run in self.runs]
-
-    @property
     def episodes_to_optimum(self) -> list[float] | None:
         """Number of real episodes until the live policy of each run is near the optimum; infinite for never."""
         if self.optimum is None or not all(run.judged for run in self.runs):
@@ -150,17 +137,15 @@ class Row:
         """All statistics: median and range over the seeds, and ratios to another row, as :func:`paired_ratio` has them.
 
         Args:
-            first: row that this one is compared with; costs of another task are not.
+            first: row that this one is compared with.
         """
-        same = self.runs[0].task == first.runs[0].task
         return {
             "seeds": sorted(self.costs),
             "J_a": spread(list(self.costs.values())),
-            "J_a_ratio": paired_ratio(self.costs, first.costs) if same else None,
+            "J_a_ratio": paired_ratio(self.costs, first.costs),
             "optimum": self.optimum,
             "paid": spread(list(self.paid.values())),
-            "paid_ratio": paired_ratio(self.paid, first.paid) if same else None,
-            "regret": spread(self.regret),
+            "paid_ratio": paired_ratio(self.paid, first.paid),
             "episodes_to_optimum": spread(self.episodes_to_optimum),
             "alarms": spread([float(run.alarms) for run in self.runs]),
             "seconds": spread([run.seconds for run in self.runs]),
@@ -174,7 +159,7 @@ class Comparison:
 
     Args:
         title: name of the system.
-        rows: rows, whose runs were judged on the same number of unseen episodes of one plant, at one place.
+        rows: rows, whose runs were judged on the same task and the same number of unseen episodes at one place.
 
     Raises:
         ValueError: if they were not, or a seed occurs twice in a row.
@@ -186,45 +171,30 @@ class Comparison:
             ("plant", [str(run.settings["plant"]) for run in runs]),
             ("number of unseen episodes", [str(len(run.costs)) for run in runs]),
             ("place of the unseen episodes", [run.place for run in runs]),
+            ("task", [json.dumps(task_of(run.settings), sort_keys=True) for run in runs]),
         ):
             if len(set(values)) > 1:
                 raise ValueError(f"the runs differ in their {name} ({', '.join(values)}); compare runs of one.")
         for row in rows:
-            seeds = [run.seed for run in row.runs]
-            if len(set(seeds)) < len(seeds):
-                folders = ", ".join(str(run.folder) for run in row.runs if seeds.count(run.seed) > 1)
-                raise ValueError(f"{folders} have the same seed and the same options; give one of them.")
+            if len(row.costs) < len(row.runs):
+                folders = ", ".join(str(run.folder) for run in row.runs)
+                raise ValueError(f"some of {folders} have the same seed and the same options; give one of them.")
         self.title, self.rows = title, rows
-
-    def tasks(self) -> list[list[Row]]:
-        """The rows, those of one task together: costs of different tasks do not compare."""
-        groups: dict[str, list[Row]] = {}
-        for row in self.rows:
-            groups.setdefault(json.dumps(row.runs[0].task, sort_keys=True), []).append(row)
-        return list(groups.values())
-
-    def controllers(self) -> dict[str, tuple[float, dict[str, float]]]:
-        """J_a and the plant's own quantities of each classical controller; of several tasks, each with a row's name."""
-        groups = self.tasks()
-        controllers: dict[str, tuple[float, dict[str, float]]] = {}
-        for rows in groups:
-            run, task = rows[0].runs[0], f" ({rows[0].name})" if len(groups) > 1 else ""
-            controllers |= {f"{name}{task}": numbers for name, numbers in run.controllers.items()}
-        return controllers
 
     def numbers(self) -> dict[str, Any]:
         """All statistics by row, and J_a of the classical controllers by name."""
         return {
             "rows": {row.name: row.numbers(self.rows[0]) for row in self.rows},
-            "controllers": {name: cost for name, (cost, _) in self.controllers().items()},
+            "controllers": {name: cost for name, (cost, _) in self.rows[0].runs[0].controllers.items()},
         }
 
     def table(self) -> str:
         """The statistics and, below them, the plant's own quantities, as two Markdown tables."""
         first = self.rows[0].name
-        numbers: dict[str, dict[str, Any]] = self.numbers()["rows"]
+        header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
+        header += [f"Σ over {first}", "episodes to 110 %", "alarms", "seconds"]
         lines, merits = [], {}
-        for name, row in numbers.items():
+        for name, row in self.numbers()["rows"].items():
             lines.append(
                 [
                     name,
@@ -234,20 +204,16 @@ class Comparison:
                     with_interval(row["J_a_ratio"]),
                     with_range(row["paid"]),
                     with_interval(row["paid_ratio"]),
-                    with_range(row["regret"]),
                     with_range(row["episodes_to_optimum"]).replace("inf", "never"),
-                    *(with_range(row[key]) for key in ("alarms", "seconds")),
+                    with_range(row["alarms"]),
+                    with_range(row["seconds"]),
                 ]
             )
             merits[name] = row["merit"]
-        for name, (cost, merit) in self.controllers().items():
-            lines.append([name, "", f"{cost:.4g}", *[""] * 8])
-            merits[name] = merit
-        optima = {row.optimum: row.name for row in reversed(self.rows) if row.optimum is not None}
-        for cost, name in reversed(optima.items()):
-            lines.append([f"optimum ({name})" if len(optima) > 1 else "optimum", "", f"{cost:.4g}", *[""] * 8])
-        header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
-        header += [f"Σ over {first}", "regret", "episodes to 110 %", "alarms", "seconds"]
+        known = {name: cost for name, (cost, _) in self.rows[0].runs[0].controllers.items()}
+        merits |= {name: merit for name, (_, merit) in self.rows[0].runs[0].controllers.items()}
+        known |= {f"optimum ({row.name})": row.optimum for row in self.rows if row.optimum is not None}
+        lines += [[name, "", f"{cost:.4g}", *[""] * (len(header) - 3)] for name, cost in known.items()]
         kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
         tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
         # Runs with limits of states have some that others have not.
@@ -262,8 +228,6 @@ class Comparison:
 
 def compare_runs(folders: Iterable[Path | str]) -> Comparison:
     """Finished runs of one plant beside each other: those that differ in nothing but the seed are one row.
-
-    Rows of different tasks, horizons or inputs have no ratio, and classical controllers of their own.
 
     Args:
         folders: run folders; the first one belongs to the row that the others are compared with.
@@ -348,46 +312,41 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure":
-    """J_a of the live policies over the real episodes: a panel for each system, and for each of its tasks.
+    """J_a of the live policies over the real episodes: a panel for each system.
 
     A line is the median of a row's seeds, its band their range. The optimum and classical controllers are horizontal.
     """
     from matplotlib.ticker import MaxNLocator  # here, because tables need no figure
 
-    from rt_torchrl.figures.style import legend_below, panels
+    from rt_torchrl.figures.style import grid, legend_below
 
-    groups = [(comparison, rows) for comparison in comparisons for rows in comparison.tasks()]
     names = list(dict.fromkeys(row.name for comparison in comparisons for row in comparison.rows))
-    columns = 2 if len(groups) == 4 else min(3, len(groups))
-    size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(groups) // columns))
-    figure, axes = panels(-(-len(groups) // columns), columns, title=title, size=size)
-    for ax in axes.flat[len(groups) :]:
-        ax.remove()
-    for ax, (comparison, rows) in zip(axes.flat, groups, strict=False):
-        whole = len(comparison.tasks()) == 1
-        _panel(ax, rows, names, comparison.title if whole else f"{comparison.title}, {rows[0].name}")
+    columns = min(3, len(comparisons))
+    size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(comparisons) // columns))
+    figure, axes = grid(len(comparisons), columns, title=title, size=size, xlabel="real episodes")
+    for ax, comparison in zip(axes, comparisons, strict=True):
+        _panel(ax, comparison, names)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.set_xlabel("real episodes")
-    legend_below(figure, list(axes.flat[: len(groups)]))
+    legend_below(figure, axes)
     return figure
 
 
-def _panel(ax: "Axes", rows: Sequence[Row], names: Sequence[str], title: str) -> None:
-    """The rows of one task of one system."""
+def _panel(ax: "Axes", comparison: Comparison, names: Sequence[str]) -> None:
+    """The rows of one system."""
     from rt_torchrl.figures.style import REFERENCE_LINE, caption, logarithmic_if_wide
 
-    for row in rows:
+    for row in comparison.rows:
         length, place = min(len(run.curve) for run in row.runs), names.index(row.name)
         curves, number = np.array([run.curve[:length] for run in row.runs]), np.arange(1, length + 1)
         look: dict[str, Any] = {"color": COLOURS[place % len(COLOURS)]}
         ax.fill_between(number, curves.min(0), curves.max(0), alpha=0.12, linewidth=0, **look)
-        marker = f"{MARKERS[place % len(MARKERS)]}-"
-        ax.plot(number, np.median(curves, 0), marker, markersize=4, label=row.name, **look)
-    for optimum in {row.optimum for row in rows if row.optimum is not None}:
+        ax.plot(number, np.median(curves, 0), "o-", markersize=4, label=row.name, **look)
+    for optimum in {row.optimum for row in comparison.rows if row.optimum is not None}:
         ax.axhline(optimum, color="black", linewidth=1.0, label="optimum")
-    for (name, (cost, _)), dash in zip(rows[0].runs[0].controllers.items(), DASHES * len(names), strict=False):
+    controllers = comparison.rows[0].runs[0].controllers
+    for (name, (cost, _)), dash in zip(controllers.items(), DASHES * len(controllers), strict=False):
         ax.axhline(cost, label=name, **REFERENCE_LINE | {"linestyle": dash})
-    caption(ax, f"{title}: $J_a$")
+    caption(ax, f"{comparison.title}: $J_a$")
     logarithmic_if_wide(ax)
 
 

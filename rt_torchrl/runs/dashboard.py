@@ -37,10 +37,6 @@ class Dashboard:
     def __init__(self, folder: Path):
         self._writer = SummaryWriter(str(folder))
 
-    def scalar(self, tag: str, value: float, step: int = 0) -> None:
-        """Write a scalar of an episode, or one of the run as a whole."""
-        self._writer.add_scalar(tag, value, step)
-
     def results(self, summary: Mapping[str, Any], table: str) -> None:
         """Write what the run has come to: the final costs, and the table as the terminal shows it.
 
@@ -49,7 +45,7 @@ class Dashboard:
             table: table of results.
         """
         for name, value in final_costs(summary).items():
-            self.scalar(f"final/{name}", value)
+            self._writer.add_scalar(f"final/{name}", value, 0)
         unseen = summary["unseen"]
         histograms = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
         for name, costs in histograms.items():
@@ -67,7 +63,7 @@ class Dashboard:
         """
         step = record["episode"]
         for tag, value in scalars_of(record).items():
-            self.scalar(tag, value, step)
+            self._writer.add_scalar(tag, value, step)
         for tag, key in (("alarm", "warning"), ("believed", "believed")):
             if record.get(key):
                 self._writer.add_text(tag, str(record[key]), step)
@@ -140,7 +136,6 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True, disable=None)
         self._total, self._line_at = total, -QUIET
         self._costs, self._doing, self._alarm = "", "starting", False
-        self._believed: str | None = None
 
     def __enter__(self) -> "Progress":
         return self
@@ -160,22 +155,17 @@ class Progress:
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
 
-        A line says when the twin's predictions begin or cease to be wrong, when another twin is believed, and why no
-        policy may act.
+        A line says when the twin's predictions begin or cease to be wrong, and why no policy may act.
         """
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:
-            message = record.get("warning", "the twin's predictions hold again")
+            usual = f"the twin's predictions {'are wrong' if alarm else 'hold again'}"
+            message = record.get("warning", usual)
             self.write(f"episode {record['episode']}: {message}")
         self._alarm = alarm
         if record["live"] == FIRST and "reason" in record:
             self.write(f"episode {record['episode']}: {record['reason']}")
-        believed = record.get("believed")
-        if believed != self._believed:
-            twin = f"the twin with {believed!r}" if believed else "the twin alone"
-            self.write(f"episode {record['episode']}: {twin} is the likeliest; J_p and closure are its own")
-        self._believed = believed
         self._bar.update()
         self._show()
         self._log(f"episode {record['episode']}/{self._total}: {self._costs}")

@@ -17,7 +17,7 @@ from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.metrics import on_the_twin, read_metrics
-from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of, require_plant
+from rt_torchrl.runs.run_config import RunConfig, plant_of, require_plant
 from rt_torchrl.runs.run_folder import load_tensors
 from rt_torchrl.runs.settings import BESIDE, class_of, read_settings, require_config
 from rt_torchrl.steps.config import Role
@@ -119,19 +119,24 @@ class LoadedRun:
         believed = self.twin.believed
         plant, closure = (self.plant, self.true_closure()) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
-        single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
-        batches = ((exogenous, 3), (initial_state, 2))
-        count = max([len(given) for given, rank in batches if given is not None and given.dim() == rank], default=1)
+        batches = [len(given) for given, rank in ((exogenous, 2), (initial_state, 1)) if _is_batch(given, rank)]
+        count = max(batches, default=1)
         # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
-        drawn = plant.draw_initial_state(count, generator)
-        start = drawn if initial_state is None else _start(plant, initial_state, count)
-        inputs = plant.draw_exogenous(count, generator) if exogenous is None else _inputs(plant, exogenous, count)
+        start = plant.draw_initial_state(count, generator)
+        if initial_state is not None:
+            start = _rows("initial_state", initial_state, 1, count, (len(plant.readings), len(plant.states)))
+            start = start if start.shape[-1] == len(plant.states) else plant.at_rest(start)
+        if exogenous is None:
+            inputs = plant.draw_exogenous(count, generator)
+        else:
+            inputs = _rows("exogenous", exogenous, 2, count, (len(plant.acting_inputs), len(plant.inputs)))
+            inputs = inputs if inputs.shape[-1] == len(plant.inputs) else plant.with_previews(inputs)
         if isinstance(policy, StateFeedback | ClassicalController):
             flown = policy.fly(start, inputs, closure, plant=plant)
         else:
             flown = Rollout(plant, closure, policy)(start, inputs)
         flown = TwinFlight(*flown) if on == "twin" else flown
-        return flown.each()[0] if single else flown
+        return flown if batches else flown.each()[0]
 
     def figure(self, name: str, flown: Trajectory | None = None) -> "Figure":
         """A figure of the training by name, as ``figures/`` of the run folder has it; see :meth:`figure_names`.
@@ -183,8 +188,7 @@ class LoadedRun:
         snapshot = self._snapshot(flown)
         where = "on the twin" if snapshot.on_the_twin else ""
         flights = figures.flights(self.physics, {self.live: snapshot.record}, where=where)
-        drawn = {"flights": flights} | figures.figures_of(snapshot)
-        return drawn | self.config.plant_figures(snapshot)
+        return {"flights": flights} | figures.figures_of(snapshot) | self.config.plant_figures(snapshot)
 
     @torch.no_grad()
     def _snapshot(self, flown: Trajectory | None) -> Snapshot:
@@ -199,14 +203,12 @@ class LoadedRun:
         read = record._replace(states=self.physics.at_rest(record.states[..., : len(self.plant.readings)]))
         n = len(read.actions)
         segment = self.metrics["summary"]["twin"]["segment"]
-        process, signals = None, self.physics.acting_inputs
+        process = None
         if self.config.twinning.arm != "model_free":
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
 
-            acted = inputs[:, : len(signals)]
-            process = ExogenousProcess.of(
-                acted, dt=self.physics.dt, signals=signals, config=self.config.twinning.exogenous
-            )
+            signals, given = self.physics.acting_inputs, self.config.twinning.exogenous
+            process = ExogenousProcess.of(inputs[:, : len(signals)], dt=self.physics.dt, signals=signals, config=given)
         return Snapshot(
             plant=self.physics,
             true_closure=None if self._only_on_the_twin else self.true_closure(),
@@ -247,7 +249,12 @@ def load_run(
     folder = Path(folder)
     settings = read_settings(folder)
     config_class = class_of(folder, settings) if recipe is None else config_class_of(recipe)
-    weights = _read_weights(folder)
+    if not (folder / "weights.pt").is_file():
+        raise ValueError(
+            f"the run in {folder} has no weights.pt: it is not finished. Go on with it by --resume; Ctrl-C ends it "
+            "and leaves the weights of the episodes done."
+        )
+    weights = load_tensors(folder / "weights.pt")
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant
     generator = torch.Generator().manual_seed(config.seed)
@@ -280,24 +287,18 @@ def _twin(
         return DigitalTwin(physics, closure)
     twin = make_twin(physics, closure, config.twinning.hypotheses)
     try:
-        if not isinstance(twin, TwinEnsemble):
-            raise ValueError(f"plant {physics.name!r} suspects nothing any more.")
-        twin.load_hypotheses(hypotheses)
+        if isinstance(twin, TwinEnsemble):
+            twin.load_hypotheses(hypotheses)
+            return twin
+        raise ValueError(f"plant {physics.name!r} suspects nothing any more.")
     except ValueError as error:
         raise ValueError(f"the hypotheses in {folder / 'weights.pt'} do not fit: {error}") from error
-    return twin
 
 
 def _rebuilt(
     folder: Path, settings: dict[str, Any], config_class: type[RunConfig], plant: Plant | None
 ) -> tuple[RunConfig, Plant]:
     """The configuration and the plant that a run's settings describe; a given plant is taken as it is."""
-    if plant is None and not issubclass(config_class, MakesPlant):
-        raise ValueError(
-            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; either "
-            "give load_run the plant, load_run(folder, plant=...), or train with a Config that has such a method, as "
-            "docs/own_plant.md shows."
-        )
     options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:
         config = read_options(config_class, options)
@@ -322,41 +323,17 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
     return load_recipe(Path(recipe)).Config
 
 
-def _read_weights(folder: Path) -> dict[str, dict[str, Any]]:
-    file = folder / "weights.pt"
-    if not file.is_file():
+def _is_batch(given: Tensor | None, rank: int) -> bool:
+    return given is not None and given.dim() > rank
+
+
+def _rows(name: str, given: Tensor, rank: int, count: int, widths: Sequence[int]) -> Tensor:
+    """What is given of one episode or of each, in double precision with a batch dimension of ``count``."""
+    rows = given if _is_batch(given, rank) else given[None]
+    if rows.dim() != rank + 1 or not rows.numel() or rows.shape[-1] not in widths or len(rows) not in (1, count):
+        columns = " or ".join(map(str, dict.fromkeys(widths)))
         raise ValueError(
-            f"the run in {folder} has no weights.pt: it is not finished. Go on with it by --resume; Ctrl-C ends it "
-            "and leaves the weights of the episodes done."
+            f"{name} of shape {tuple(given.shape)} must have {rank} dimensions, the last of {columns}, or a batch of "
+            f"{count} of them."
         )
-    return load_tensors(file)
-
-
-def _start(plant: Plant, states: Tensor, count: int) -> Tensor:
-    """Given initial states, of which the unread ones may be left out."""
-    if states.shape[-1:] == (len(plant.readings),):
-        return plant.at_rest(_rows(states, "initial_state", count, (len(plant.readings),)))
-    return _rows(states, "initial_state", count, (len(plant.states),))
-
-
-def _rows(values: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:
-    """A tensor in double precision with a batch dimension of ``count``."""
-    if tuple(values.shape[-len(shape) :]) != shape or values.dim() - len(shape) not in (0, 1):
-        raise ValueError(f"{name} of shape {tuple(values.shape)} must have the shape {shape}, or a batch of it.")
-    rows = values.to(torch.float64).reshape(-1, *shape)
-    if len(rows) not in (1, count):
-        raise ValueError(f"{name} has {len(rows)} episodes, others {count}; give as many of each, or one.")
-    return rows.expand(count, *shape).contiguous()
-
-
-def _inputs(plant: Plant, exogenous: Tensor, count: int) -> Tensor:
-    acting, total = len(plant.acting_inputs), len(plant.inputs)
-    n, width = (*exogenous.shape[-2:],) if exogenous.dim() >= 2 else (0, 0)
-    if n < 1 or width not in (acting, total):
-        names = ", ".join(signal.name for signal in plant.acting_inputs)
-        raise ValueError(
-            f"exogenous of shape {tuple(exogenous.shape)} must have a row for each control interval and a column for "
-            f"each input ({names or 'none'})."
-        )
-    rows = _rows(exogenous, "exogenous", count, (n, width))
-    return rows if width == total else plant.with_previews(rows)
+    return rows.to(torch.float64).expand(count, *rows.shape[1:]).contiguous()

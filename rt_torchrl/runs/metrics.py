@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from rt_torchrl.atomic_file import read_json
-from rt_torchrl.steps.config import ROLES, Role
+from rt_torchrl.steps.config import ROLES
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
@@ -19,12 +19,8 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         raise ValueError(f"the run in {folder} has no metrics.json: it is not finished; go on with it by --resume.")
     metrics = read_json(file)
     episodes, summary = metrics.get("episodes"), metrics.get("summary")
-    if not (isinstance(episodes, list) and all(isinstance(e, dict) for e in episodes) and isinstance(summary, dict)):
-        raise ValueError(
-            f"{file} is damaged: it must be an object with episodes, a list of objects, and summary, an object."
-        )
-    if (live := summary.get("live")) not in ROLES:
-        raise ValueError(f"{file} is damaged: summary names the live policy {live!r}; it must be {' or '.join(ROLES)}.")
+    if not (isinstance(episodes, list) and isinstance(summary, dict) and summary.get("live") in ROLES):
+        raise ValueError(f"{file} is damaged: it must hold episodes, a list, and summary with the live policy.")
     return metrics
 
 
@@ -42,43 +38,23 @@ def on_the_twin(unseen: Mapping[str, Any]) -> bool:
     return unseen["judged_on"] == "twin"
 
 
-def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str, float], str]:
-    """J_a of the live policy, None if it is not finite; the finite ones of classical controllers; and where these hold.
+def judged_on_the_system(summary: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``costs``, ``merit`` and ``baselines`` of a run on the system, not on the run's own twin.
 
-    They are those of the flights on the real system, if the live policy has flown there, and else of unseen episodes: a
-    cost on the twin is not compared with one on the real system.
-    """
-    unseen, live = summary["unseen"], summary["live"]
-    flown = summary.get("real_unseen", {}).get("controllers", {})
-    judged, where = unseen["baselines"] | {live: {"J_a": unseen[f"J_a_{live}"]}}, unseen["judged_on"]
-    if live in flown:
-        judged, where = dict(flown), "real system"
-    cost = judged.pop(live)["J_a"]["mean"]
-    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
-    return cost, {name: mean for name, mean in means.items() if mean is not None}, where
-
-
-def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], Role]:
-    """What the policy of a run has cost on the system, not on the run's own twin, and the role of that policy.
-
-    Returns:
-        The entry ``unseen``, or entries of the same names from the flights on the real system; and the role of the
-        policy that was live at the end, whose costs they hold.
+    They are those of the entry ``unseen``, or of the flights on the real system.
 
     Raises:
         ValueError: if the run was judged on its own twin alone.
     """
     unseen = summary["unseen"]
     if not on_the_twin(unseen):
-        return unseen, summary["live"]
-    real, live = summary.get("real_unseen", {"controllers": {}}), summary["live"]
-    if live not in real["controllers"]:
+        return unseen
+    real = summary.get("real_unseen", {"controllers": {}})
+    if summary["live"] not in real["controllers"]:
         raise ValueError(
             "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run "
             "by --resume and --real-unseen, which flies its live policy on the real system."
         )
-    flown = real["controllers"]
-    others = {name: entry for name, entry in flown.items() if name != live}
-    merit = {name: entry["merit"] for name, entry in flown.items()}
-    count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
-    return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live
+    baselines = {name: entry for name, entry in real["controllers"].items() if name != summary["live"]}
+    merit = {name: entry["merit"] for name, entry in real["controllers"].items()}
+    return {"costs": real["costs"], "merit": merit, "baselines": baselines}

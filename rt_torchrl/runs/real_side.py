@@ -1,9 +1,8 @@
 """The real system of a run: in simulation, operated beside the learning, and flown after the training."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import nn
@@ -11,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes, compared
+from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
@@ -25,7 +24,6 @@ from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -101,32 +99,19 @@ def operation_of(
         first: what the training begins with, whose teacher may act, too.
 
     Raises:
-        ValueError: if episodes of the plant may end early, there is no function that makes the real system, the device
-            is not the CPU, or :class:`Operation` raises it.
+        ValueError: if one of these does not allow it, or :class:`Operation` raises it.
     """
-    if plant.end_cost is not None:
+    if plant.end_cost is not None or make_env is None or config.device != "cpu":
         raise ValueError(
-            f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
-            "--asynchronous."
+            "asynchronous needs a function that makes the real system in another process, Run(..., env=), episodes "
+            f"that do not end early, and the CPU; here device={config.device!r}, and the plant is {plant.name!r}."
         )
-    if make_env is None:
-        raise ValueError(
-            "asynchronous needs the real system in a process of its own; give Run(..., env=) a function that makes it."
-        )
-    if config.device != "cpu":
-        raise ValueError(f"asynchronous acts on the CPU alone, and device={config.device!r}; give --device cpu.")
     acting: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
     if first is not None and first.teacher is not None:
         acting[FIRST] = first.teacher
     seed = episode_seed(config.seed, NOISE)
     operator = Operator(make_env, plant, acting, config.twinning.exploration, config.operation, seed=seed)
     return Operation(operator, env)
-
-
-def end_operation(algorithm: ReinforcementTwinning) -> None:
-    """End the operation of the real system, if it operates while the algorithm learns."""
-    if algorithm.operating is not None:
-        algorithm.operating.operation.close()
 
 
 def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Mapping[Role, nn.Module]) -> str:
@@ -146,71 +131,8 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
     return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
 
 
-def announcement(names: Iterable[str], live: Role, count: int) -> str:
-    """How many flights of whom there will be on the real system, where each controller makes so many."""
-    called = [f"the live policy ({live.replace('_', '-')})" if name == live else name for name in names]
-    counts = ", ".join(f"{count} of {who}" for who in called)
-    return f"{count * len(called)} flights on the real system: {counts}; they count as paid"
-
-
-def entries(
-    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
-) -> dict[str, Any]:
-    """The entry ``real_unseen`` of the summary, without J_p.
-
-    Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
-    the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
-
-    Args:
-        plant: plant of the real system.
-        flights: flights by the name of the controller.
-        judged: what these cost.
-        live: name of the live policy, which need not have flown.
-    """
-    controllers = {}
-    for name, judgement in judged.items():
-        costs = judgement.control_costs
-        controllers[name] = {"episodes": len(costs)} | judgement.statistics()
-        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
-            controllers[name] |= compared(judged[live].control_costs, costs)
-    return {
-        "controllers": controllers,
-        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
-    }
-
-
-def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
-    """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
-    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
-        return False
-    for flights in zip(flown.each(), other.each(), strict=True):
-        inputs = [until_end(plant, flight).exogenous for flight in flights]
-        n = min(map(len, inputs))
-        if not torch.equal(inputs[0][:n], inputs[1][:n]):
-            return False
-    return True
-
-
-def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
-    """The entry that an earlier end of a run has left after as many episodes; None without.
-
-    Args:
-        folder: run folder.
-        episodes: number of episodes of the training.
-        names: names of the controllers that are to fly.
-        count: number of flights of each.
-    """
-    if not (folder / "metrics.json").is_file():
-        return None
-    metrics = read_metrics(folder)
-    entry: dict[str, Any] | None = metrics["summary"].get("real_unseen")
-    if entry is None or len(metrics["episodes"]) != episodes:
-        return None
-    flown = {name: controller["episodes"] for name, controller in entry["controllers"].items()}
-    return entry if flown == dict.fromkeys(names, count) else None
-
-
 def paid_before(folder: Path) -> list[float | None]:
     """J_a of the flights that earlier ends of a resumed run have made; null stands for one that is not finite."""
-    ended = (folder / "metrics.json").is_file()
-    return list(read_metrics(folder)["summary"]["cost_of_learning"].get("judging", [])) if ended else []
+    if not (folder / "metrics.json").is_file():
+        return []
+    return list(read_metrics(folder)["summary"]["cost_of_learning"].get("judging", []))

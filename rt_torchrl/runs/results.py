@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,12 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
 from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin, real_costs
+from rt_torchrl.runs.metrics import on_the_twin, real_costs
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -84,9 +83,8 @@ def summarise(
     judged: dict[str, Judged],
     initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
-    episodes: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    """The entry ``summary`` of ``metrics.json``.
+    """What the entry ``summary`` of ``metrics.json`` says of twin and policies.
 
     Every ratio is a cost on the unseen episodes after training over the same cost before. J_p before and after belong
     to the same episodes, which the final live policy has flown. What is said of the twin is said of the one that is
@@ -102,13 +100,25 @@ def summarise(
     first = algorithm.belief.beside_first(algorithm.policies[live], teacher)
     means = {"J_p": J_p, "J_p_before": J_p_before}
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
+    overall = {name: judgement.statistics() for name, judgement in judged.items()}
+    baselines = {
+        name: overall[name] | compared(judged[live].control_costs, judgement.control_costs)
+        for name, judgement in judged.items()
+        if name not in ROLES
+    }
     return {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
-        "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on, "J_p_each": J_p.tolist()}
-        | {name: mean_with_confidence(values) for name, values in means.items()}
-        | results(judged, live),
-        "cost_of_learning": cost_of_learning(episodes),
+        "unseen": {
+            "episodes": len(unseen.initial_state),
+            "judged_on": unseen.judged_on,
+            "J_p_each": J_p.tolist(),
+            **{name: mean_with_confidence(values) for name, values in means.items()},
+            **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
+            "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
+            "merit": {role: overall[role]["merit"] for role in ROLES},
+            "baselines": baselines,
+        },
         "live": live,
         "first": None if first is None else dict(zip(("expected", "paid"), first, strict=True)),
         "better": better_of(algorithm, unseen),
@@ -117,7 +127,6 @@ def summarise(
         "twin": fit_of(algorithm),
         "hypotheses": hypotheses_of(algorithm.twin),
         "believed": algorithm.twin.hypothesis,
-        "seconds": seconds_per_step(episodes),
     }
 
 
@@ -169,19 +178,6 @@ def twin_costs(
     return [unseen.identification_costs(physics, closure, flown, segment) for physics, closure in laws]
 
 
-def results(judged: dict[str, Judged], live: Role) -> dict[str, Any]:
-    """Statistics of all controllers on the unseen episodes, of classical ones with the live policy beside."""
-    overall = {name: judgement.statistics() for name, judgement in judged.items()}
-    for name in overall.keys() - set(ROLES):
-        overall[name] |= compared(judged[live].control_costs, judged[name].control_costs)
-    return {
-        **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
-        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
-        "merit": {role: overall[role]["merit"] for role in ROLES},
-        "baselines": {name: statistics for name, statistics in overall.items() if name not in ROLES},
-    }
-
-
 def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
     """``weight`` and named ``weights`` of what is planned on beside the twin alone, by name; empty if nothing is.
 
@@ -191,13 +187,16 @@ def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
         return {}
     hypotheses: dict[str, Any] = {}
     for name, weight in twin.weights.items():
-        if name != ALONE:
-            closure = twin.twins[name].closure
-            # A delay of whole intervals has no parameters of its own.
-            parts = closure.extension_parameters if isinstance(closure, ExtendedClosure) else ()
-            weights = {key: value for part in parts for key, value in (named_weights(part) or {}).items()}
-            described = {key: value for part in parts for key, value in described_weights(part).items()}
-            hypotheses[name] = {"weight": weight, "weights": weights, "described": described}
+        if name == ALONE:
+            continue
+        closure = twin.twins[name].closure
+        weights: dict[str, Any] = {}
+        described: dict[str, Any] = {}
+        # A delay of whole intervals has no parameters of its own.
+        for part in closure.extension_parameters if isinstance(closure, ExtendedClosure) else ():
+            weights |= named_weights(part) or {}
+            described |= described_weights(part)
+        hypotheses[name] = {"weight": weight, "weights": weights, "described": described}
     return hypotheses
 
 
@@ -222,20 +221,6 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
     return dict(total)
 
 
-def reference_of(
-    unseen: UnseenEpisodes, make_policy: Callable[[torch.Generator], nn.Module], better: float
-) -> dict[str, float]:
-    """The entry ``reference`` of the summary: what exact gradients on the true plant reach.
-
-    Args:
-        unseen: the unseen episodes.
-        make_policy: function that draws a random policy of the class.
-        better: mean J_a of the better policy of the training on these episodes.
-    """
-    best = exact_optimum(unseen, make_policy)
-    return {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "better_over_reference": better / best.cost}
-
-
 MOST_WEIGHTS = 12
 """Greatest number of weights of the closure that the table shows."""
 MOST_ERRORS = 2
@@ -250,21 +235,19 @@ WHERE = {
 def progress(record: dict[str, Any]) -> str:
     """The costs of an episode and its live policy, as the progress bar shows them."""
     errors = {key.removeprefix("rms/"): value for key, value in record.items() if key.startswith("rms/")}
-    named = [("J_a mb", "J_a_model_based"), ("J_a mf", "J_a_model_free"), ("real", "real_cost")]
-    named = named if errors else [("J_p", "J_p"), *named]
-    costs = [f"{name} {in_words(record[key])}" for name, key in named if record.get(key) is not None]
-    return ", ".join([*rms_words(errors, most=MOST_ERRORS), *costs, f"live {record['live'].replace('_', '-')}"])
+    named = {"J_a mb": "J_a_model_based", "J_a mf": "J_a_model_free", "real": "real_cost"}
+    costs = [f"{name} {in_words(record[key])}" for name, key in named.items() if record.get(key) is not None]
+    return ", ".join([*rms_words(errors)[:MOST_ERRORS], *costs, f"live {record['live'].replace('_', '-')}"])
 
 
-def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
+def rms_words(errors: dict[str, float | None]) -> list[str]:
     """RMS errors of the twin in words, each with its unit; None stands for one that is not finite.
 
     Args:
         errors: the errors, by ``STATE [UNIT]``.
-        most: greatest number of errors that are shown.
     """
     words = []
-    for label, value in list(errors.items())[:most]:
+    for label, value in errors.items():
         name, unit = label.removesuffix("]").split(" [")
         finite = value is not None and math.isfinite(value)
         words.append(f"{name} {value:.3g} {unit}".removesuffix(" -") if finite else f"{name} diverges")
@@ -273,14 +256,11 @@ def rms_words(errors: dict[str, float | None], most: int = 1000) -> list[str]:
 
 def results_table(metrics: dict[str, Any]) -> str:
     """The table of results that the terminal shows at the end of a run."""
-    summary = metrics["summary"]
-    unseen, n = summary["unseen"], summary["unseen"]["episodes"]
-    where = WHERE.get(unseen["judged_on"], "")
-    twin = " on the twin" if on_the_twin(unseen) else ""
-    if twin and summary["twin"]["noise"]:
-        where = where.replace(twin, f"{twin} with noise of the sensors")
+    summary, episodes = metrics["summary"], metrics["episodes"]
+    unseen, fitted, paid = summary["unseen"], summary["twin"], summary["cost_of_learning"]
+    where, twin = WHERE.get(unseen["judged_on"], ""), " on the twin" if on_the_twin(unseen) else ""
     width = 22 + len(twin)
-    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
+    lines = ["", f"{metrics['plant']}, {len(episodes)} episodes, judged on {unseen['episodes']} unseen ones{where}"]
     lines.append(f"  {'cost':<{width}}{'untrained':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
     # A twin has no J_p on episodes that it has flown itself.
     rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", summary["J_p_ratio"])]
@@ -296,25 +276,27 @@ def results_table(metrics: dict[str, Any]) -> str:
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
-        lines.append(beside_line(baseline, n))
+        ratio = f"{_number(baseline['ratio']['mean'], '.4g')} {_interval(baseline['ratio'])}"
+        cheaper = f"cheaper in {baseline['cheaper']} of {unseen['episodes']}"
+        lines.append(f"    on the same episodes the live policy costs {ratio} of it, {cheaper}")
     lines += merit_lines(unseen)
-    lines += real_lines(summary.get("real_unseen"), summary["twin"]["segment"])
-    paid = summary["cost_of_learning"]
+    lines += real_lines(summary.get("real_unseen"))
     whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
-    judging = paid.get("judging", [])
-    spent = _number(None if None in judging else sum(judging), ".4g")
-    after = f", {spent} of it over {len(judging)} after the training" if judging else ""
+    after = f", {len(paid['judging'])} of them after the training" if "judging" in paid else ""
     lines.append(
         f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {whole} over "
         f"{paid['episodes']} episodes{after}, largest {most}"
     )
-    lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
+    if dearer_than_first(summary):
+        lines.append(
+            f"  in the real episodes of the controller that flew first, which cost {summary['first']['paid']:.4g}, the "
+            f"live policy is expected to cost {_number(summary['first']['expected'], '.4g')}"
+        )
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
-    fitted = summary["twin"]
     # A fit whose residuals are noise has answered the doubts of the first flight.
     if fitted["note"] or not fitted["rms"]:
-        lines += [f"  first flight: {doubt}" for doubt in metrics["episodes"][0].get("doubts", ())]
-    lines += alarm_lines(metrics["episodes"])
+        lines += [f"  first flight: {doubt}" for doubt in episodes[0].get("doubts", ())]
+    lines += alarm_lines(episodes)
     lines += fit_lines(fitted)
     lines += closure_lines(summary["closure"], fitted["standard_errors"])
     lines += [f"  {note}" for note in [fitted["note"]] if note]
@@ -322,30 +304,19 @@ def results_table(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
+def real_lines(real: dict[str, Any] | None) -> list[str]:
     """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
     if real is None:
         return []
     lines = []
     if "J_p" in real:
         before, after = (_number(real[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
-        over = f", over segments of {segment} intervals" if segment else ""
-        lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
+        lines.append(f"  J_p on the real system: {after}, with the first closure {before}")
     for name, entry in real["controllers"].items():
-        mean, who = _number(entry["J_a"]["mean"], ".5g"), name.replace("_", "-")
-        lines.append(
-            f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean} {_interval(entry['J_a'])}"
-        )
-        if "ratio" in entry:
-            lines.append(beside_line(entry, entry["episodes"]))
-        lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in entry["merit"].items()]
+        mean, who = f"{_number(entry['J_a']['mean'], '.5g')} {_interval(entry['J_a'])}", name.replace("_", "-")
+        lines.append(f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean}")
+        lines += [f"    {quantity:<26}{_value(merit):>20}" for quantity, merit in entry["merit"].items()]
     return lines
-
-
-def beside_line(entry: dict[str, Any], episodes: int) -> str:
-    """A line with what the live policy costs beside a controller in the same episodes."""
-    ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
-    return f"    on the same episodes the live policy costs {ratio} of it, cheaper in {entry['cheaper']} of {episodes}"
 
 
 def _number(value: float | None, digits: str) -> str:
@@ -377,45 +348,35 @@ def _value(merit: dict[str, Any]) -> str:
 
 
 def fit_lines(twin: dict[str, Any]) -> list[str]:
-    """A line with the twin's RMS errors over the records, or the segments, that it was last fitted to."""
-    if not twin["rms"]:
-        return []
+    """Lines with the twin's RMS errors over the records, or the segments, of the last fit, and the sensors' noise."""
     where = f"segments of {twin['segment']} intervals" if twin["segment"] else "its last records"
-    lines = [f"  twin over {where}: {', '.join(rms_words(twin['rms']))}"]
-    if twin["noise"]:
-        lines.append(f"  noise of the sensors: {', '.join(rms_words(twin['noise']))}")
-    return lines
+    entries = {f"twin over {where}": twin["rms"], "noise of the sensors": twin["noise"]}
+    return [f"  {name}: {', '.join(rms_words(errors))}" for name, errors in entries.items() if errors]
 
 
-def closure_lines(closure: dict[str, Any], errors: dict[str, float | None] | None = None) -> list[str]:
+def closure_lines(closure: dict[str, Any], errors: dict[str, float | None]) -> list[str]:
     """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
 
     The true weights of the same names and the standard errors are shown, if there are any.
     """
-    weights = closure["found"]
+    weights, true = closure["found"], closure.get("true") or {}
     if not weights or not all(isinstance(value, float | None) for value in weights.values()):
         return []
     if len(weights) > MOST_WEIGHTS:
         return [f"  closure: {len(weights)} weights, in metrics.json"]
-    true = {name: value for name, value in (closure.get("true") or {}).items() if name in weights}
     columns = {"start": closure["start"], "found": weights}
     columns |= {"std. error": errors} if errors else {}
-    columns |= {"true": true} if true else {}
+    columns |= {"true": true} if weights.keys() & true.keys() else {}
     lines = [f"  {'closure weight':<22}" + "".join(f"{column:>12}" for column in columns)]
     for name in weights:
         description = closure["described"].get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{description['unit']}]" if description["unit"] else name
-        cells = {column: _number(values.get(name), ".5g") for column, values in columns.items()}
-        if errors and errors.get(name) == 0.0:
-            cells["std. error"] = "fixed"
-        row = "".join(f"{cell:>12}" for cell in cells.values())
+        row = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
         lines.append(f"  {label:<22}{row}   {description['meaning']}".rstrip())
-    if any(error is None or math.isinf(error) for name, error in (errors or {}).items() if name in weights):
-        lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
     return lines
 
 
-def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None = None) -> list[str]:
+def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None) -> list[str]:
     """Lines with what the twin lacks, as the hypotheses that explain the records have found it.
 
     Args:
@@ -424,10 +385,11 @@ def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None = None) ->
     """
     lines = []
     for name, hypothesis in hypotheses.items():
-        named = {key: value for key, value in hypothesis["weights"].items() if isinstance(value, float)}
-        units = {key: hypothesis["described"].get(key, {}).get("unit", "") for key in named}
-        weights = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
-        line = f"  beside the twin: {name}, weight {hypothesis['weight']:.2f}" + (f", {weights}" if weights else "")
+        line = f"  beside the twin: {name}, weight {hypothesis['weight']:.2f}"
+        for key, value in hypothesis["weights"].items():
+            if isinstance(value, float):
+                unit = hypothesis["described"].get(key, {}).get("unit", "")
+                line += f", {key} = {value:.4g} {unit}".rstrip()
         lines.append(line + ("; J_p and closure weights are its own" if name == believed else ""))
     return lines
 
@@ -443,19 +405,13 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     return [f"  {text}", *(f"  episode {record['episode']}: {record['warning']}" for record in warned)]
 
 
-def dearer_than_first(summary: Mapping[str, Any]) -> str:
-    """That the controller that flew first is expected to cost less than the live policy; empty if it is not."""
+def dearer_than_first(summary: Mapping[str, Any]) -> bool:
+    """Whether the controller that flew first is expected to cost less than the live policy."""
     first = summary["first"]
-    if first is None or (first["expected"] is not None and first["expected"] <= first["paid"]):
-        return ""
-    expected = _number(first["expected"], ".4g")
-    return (
-        f"in the real episodes of the controller that flew first, which cost {first['paid']:.4g}, the live policy is "
-        f"expected to cost {expected}"
-    )
+    return first is not None and (first["expected"] is None or first["expected"] > first["paid"])
 
 
-def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
+def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
     Args:
@@ -463,29 +419,24 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         folder: run folder.
         config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
     """
-    summary, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
-    live, (cost, known, place) = summary["live"], costs_at_the_end(summary)
-    twin = place == "twin"
-    best = min(known, key=known.__getitem__, default=None)
-    call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
+    summary = metrics["summary"]
+    better, unseen = summary["better"], summary["unseen"]
+    made = isinstance(config, MakesPlant)
+    call = f"rt_torchrl.load_run({str(folder)!r}{'' if made else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
-    if cost is None:
-        where = "unseen episodes on the twin" if twin else "unseen episodes"
-        steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
-    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
-        better = best if best is not None and cost >= known[best] else "the controller that flew first"
-        other = "let the policy observe what that controller computes, or train with more --twinning.planner.iterations"
-        steps.append(f"{better} is better than the live policy: keep it, {other}")
-    elif summary["better"] != live:
-        steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
-    elif not alone:
-        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
-    elif live == "model_based" and config is not None and config.twinning.planner.method == "receding_horizon":
-        steps.append(f"take the twin away, on which it plans: {call_of('export')} {folder} --what twin")
-    else:
-        steps.append(f"take the controller away: {call_of('export')} {folder} --role {live}")
-    if twin and "real_unseen" not in summary:
+    cost = unseen[f"J_a_{better}"]["mean"]
+    known = [mean for baseline in unseen["baselines"].values() if (mean := baseline["J_a"]["mean"]) is not None]
+    if cost is None or cost >= min(known, default=math.inf) or (on_the_twin(unseen) and dearer_than_first(summary)):
         steps.append(
-            "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
+            "no policy is better than the classical controllers, or it diverges: train longer, let it observe what "
+            "they compute, or give more --twinning.planner.iterations"
         )
+    elif not made:
+        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({better!r}), 'it.c', plant)")
+    else:
+        plans = better == "model_based" and config.twinning.planner.method == "receding_horizon"
+        what = "--what twin" if plans else f"--role {better}"
+        steps.append(f"take the controller away: {call_of('export')} {folder} {what}")
+    if on_the_twin(unseen) and "real_unseen" not in summary:
+        steps.append("judge the live policy on the real system: --resume and, for five flights, --real-unseen 5")
     return "\n".join(f"  next: {step}" for step in steps)

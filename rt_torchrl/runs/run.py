@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import errno
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
@@ -17,6 +17,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
+from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, mean_with_confidence
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
@@ -104,10 +105,10 @@ class Run:
         self.config = dataclasses.replace(config, start=begins).effective()
         self.ended: str | None = None
         self.callbacks = callbacks
-        device = require_device(config.device)
+        self.device = require_device(config.device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
-        real = env if isinstance(env, RealSystem) or env is None else env()
-        physics = known_physics(config, plant, real, first, baselines).to(device)
+        self._real = env if isinstance(env, RealSystem) or env is None else env()
+        physics = known_physics(config, plant, self._real, first, baselines).to(self.device)
         laws = dict(baselines or {})
         if begins == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
@@ -120,23 +121,22 @@ class Run:
         self._held = RunFolder(config, plant.name, {name: numbers_of(law) for name, law in named.items()})
         self.folder = self._held.path
         try:
-            if real is None:
-                make_env = functools.partial(real_side.simulated, plant, config, first, device=device)
-            system = real or real_side.simulated(plant, config, first, device=device)
+            if self._real is None:
+                make_env = functools.partial(real_side.simulated, plant, config, first, device=self.device)
+            system = self._real or real_side.simulated(plant, config, first, device=self.device)
             make_learner = learner or functools.partial(ActorCritic, replay=replay)
-            self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector, device=device)
-            self.unseen = real_side.judged_on(plant, self.algorithm.twin, real, self.config, device=device)
-            self._real, self._device = real, device
-            self.baselines = {name: law.to(device) for name, law in controllers.items()}
+            self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector)
+            self.unseen = real_side.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
+            self.baselines = {name: law.to(self.device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
+            self._doubts: tuple[str, ...] = ()
             if self._held.resumes():
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
                 self.started -= sum(results.seconds_per_step(self.episodes).values())
-            elif real is not None and config.preflight:
+            elif self._real is not None and config.preflight:
                 self.algorithm.flights.check = self._require_wiring
-            self._doubts: tuple[str, ...] = ()
         except BaseException:
             self._held.release()
             raise
@@ -148,14 +148,12 @@ class Run:
         physics: Plant,
         makers: tuple[MakeLearner, MakePlanner, MakeReferee],
         collector: MakeCollector,
-        *,
-        device: torch.device,
     ) -> None:
         config, (make_learner, planner, referee) = self.config, makers
-        generator = torch.Generator(device=device).manual_seed(config.seed)
+        generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, physics)
-        policies = {role: policy.to(device) for role, policy in config.make_policies(physics, generator).items()}
-        closure = config.make_closure(physics, generator).to(device)
+        policies = {role: policy.to(self.device) for role, policy in config.make_policies(physics, generator).items()}
+        closure = config.make_closure(physics, generator).to(self.device)
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
         table, twin = config.twinning, twin_of(config, physics, closure, first)
@@ -165,8 +163,7 @@ class Run:
         self.algorithm = ReinforcementTwinning(
             env,
             twin,
-            model_free=policies["model_free"],
-            model_based=policies["model_based"],
+            **policies,
             config=table,
             generator=generator,
             learner=learner,
@@ -210,8 +207,13 @@ class Run:
                 print(f"{how}: {done} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
-            real_side.end_operation(self.algorithm)
+            self._end_operation()
             self._held.release()
+
+    def _end_operation(self) -> None:
+        """End the operation of the real system, if it operates while the algorithm learns."""
+        if self.algorithm.operating is not None:
+            self.algorithm.operating.operation.close()
 
     def _train(self) -> dict[str, Any]:
         self._held.begin(self.config)
@@ -220,16 +222,15 @@ class Run:
             bar.doing("checking the gradient")
             # Model predictive control has no weights of its own whose gradient could be checked.
             checked: Role = "model_free" if self.config.twinning.planner.method == "receding_horizon" else "model_based"
-            physics = self.algorithm.twin.plant
-            engine = self.config.engine
+            engine, physics = self.config.engine, self.algorithm.twin.plant
             gap = engine_gap(physics, self.initial_closure, self.initial_policies[checked], self.unseen, engine)
-            dashboard.scalar(f"gradient/relative gap of {engine} to autograd, short horizon", gap)
             require_agreement(gap, engine, physics)
             self._all_episodes(dashboard, bar)
             if not self.episodes:
                 raise Interrupted("interrupted before the first episode was done; nothing to report.")
-            self._drop_half_an_episode()
-            real_side.end_operation(self.algorithm)
+            if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
+                self.episodes = load_checkpoint(self.folder, self.algorithm)  # as the last whole episode has left it
+            self._end_operation()
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
             self._follow_wear()
@@ -256,9 +257,8 @@ class Run:
                     safe_point()
                     self._episode(dashboard, bar)
                     bar.episode(self.episodes[-1])
-                    reasons = [reason for callback in self.callbacks if (reason := callback(self.episodes))]
-                    if reasons:
-                        self.ended = "; ".join(reasons)
+                    self.ended = "; ".join(reason for tell in self.callbacks if (reason := tell(self.episodes))) or None
+                    if self.ended is not None:
                         bar.write(f"ended after {len(self.episodes)} episodes: {self.ended}")
                         break
             except BaseException as error:
@@ -285,11 +285,8 @@ class Run:
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
-        done = [*self.episodes, record]
-        short = save_checkpoint(self.folder, self.algorithm, done)
+        save_checkpoint(self.folder, self.algorithm, [*self.episodes, record])
         self.episodes.append(record)
-        if short is not None:
-            raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record, self.algorithm.policies)
 
     def _follow_wear(self) -> None:
@@ -297,32 +294,23 @@ class Run:
         if self.algorithm.env.closure is not None:
             self.unseen.closure = self.algorithm.env.closure
 
-    def _drop_half_an_episode(self) -> None:
-        """Go back to the end of the last whole episode after an interrupt."""
-        if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
-            self.episodes = load_checkpoint(self.folder, self.algorithm)
-
     def _fly_the_real_system(self, bar: Progress) -> dict[str, Any] | None:
         """The entry ``real_unseen`` of the summary, if flights of the real system were asked for.
 
         Before the first flight the run says how many of whom. Who has pressed Ctrl-C does not want the system to go on.
         """
-        config, live = self.config, self.algorithm.referee.live
-        interrupted = len(self.episodes) < config.episodes and self.ended is None
-        if self._real is None or not config.real_unseen:
+        count, live = self.config.real_unseen, self.algorithm.referee.live
+        interrupted = len(self.episodes) < self.config.episodes and self.ended is None
+        if self._real is None or not count or interrupted:
             return None
-        reason = real_side.grounded(config, self.algorithm, self.initial_policies)
-        if reason:
+        laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
+        if reason := real_side.grounded(self.config, self.algorithm, self.initial_policies):
             bar.write(f"the live policy does not fly the real system: {reason}")
-        laws = ({} if reason else {live: self.algorithm.policies[live]}) | self.baselines
-        if before := real_side.judged_before(self.folder, len(self.episodes), laws, config.real_unseen):
-            bar.write("the real system has been flown after these episodes; it is not flown again")
-            return before
-        if not laws or interrupted:
-            return None
-        bar.write(real_side.announcement(laws, live, config.real_unseen))
+            del laws[live]
+        names = ", ".join(f"{count} of {name}" for name in laws)
+        bar.write(f"{count * len(laws)} flights on the real system, which count as paid: {names}")
         bar.doing("judging on the real system")
-        episodes = RealEpisodes(self._real, config.real_unseen, device=self._device)
+        episodes = RealEpisodes(self._real, count, device=self.device)
         episodes.bounds = self.unseen.bounds
         flights = dict[str, Trajectory]()
         for name, law in laws.items():
@@ -333,11 +321,13 @@ class Run:
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        self._paid += [cost for judgement in judged.values() for cost in judgement.control_costs.tolist()]
-        entry = real_side.entries(episodes.plant, flights, judged, live)
+        costs = {name: judgement.control_costs.tolist() for name, judgement in judged.items()}
+        self._paid += [cost for of_controller in costs.values() for cost in of_controller]
+        controllers = {name: {"episodes": count} | judgement.statistics() for name, judgement in judged.items()}
+        entry: dict[str, Any] = {"controllers": controllers, "costs": costs}
         if live in flights:
-            costs = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
-            entry |= {name: mean_with_confidence(cost) for name, cost in zip(("J_p", "J_p_before"), costs, strict=True)}
+            J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
+            entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}
         return entry
 
     def _results(
@@ -348,18 +338,19 @@ class Run:
         real: dict[str, Any] | None,
         judging: float,
     ) -> dict[str, Any]:
-        parts = self.initial_policies, self.initial_closure, self.episodes
+        parts = self.initial_policies, self.initial_closure
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         if real is not None:
             summary["real_unseen"] = real
         summary["cost_of_learning"] = results.cost_of_learning(self.episodes, self._paid)
         if self.config.reference:
-            better = judged[summary["better"]].control_costs.mean().item()
-            summary["reference"] = results.reference_of(self.unseen, self.make_policy, better)
+            best, better = exact_optimum(self.unseen, self.make_policy), judged[summary["better"]].control_costs.mean()
+            summary["reference"] = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients}
+            summary["reference"]["better_over_reference"] = better.item() / best.cost
         summary |= {"engine_gap": gap, "ended": self.ended}
-        total = time.perf_counter() - self.started
-        summary["seconds"]["judge"] = judging
-        summary["seconds"] |= {"rest": total - sum(summary["seconds"].values()), "total": total}
+        total, seconds = time.perf_counter() - self.started, results.seconds_per_step(self.episodes)
+        seconds["judge"] = judging
+        summary["seconds"] = seconds | {"rest": total - sum(seconds.values()), "total": total}
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
         # Metrics of an earlier end must not lie beside these weights, because they say that the run is finished.

@@ -141,8 +141,6 @@ class RunConfig:
 
         Override this method, and the ``Literal`` that declares ``policy``, for policies of your own.
         """
-        if not options.choices(type(self), "policy") and self.policy not in ("plant", "mlp"):
-            raise ValueError(f"policy={self.policy!r} does not exist; choose plant or mlp, or override make_policy.")
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
         return plant.make_policy(generator)
@@ -225,26 +223,18 @@ class RunConfig:
 
     def effective(self) -> "RunConfig":
         """The options that the run carries out, in which ``start`` and ``quick`` have replaced other options."""
-        twinning = self.twinning
+        twinning, least = self.twinning, {}
         if self.start not in (None, "random"):
             twinning = dataclasses.replace(twinning, exploration=twinning.exploration.imitating())
-        if not self.quick:
-            return dataclasses.replace(self, twinning=twinning)
-        usual = twinning.learner
-        learner = dataclasses.replace(
-            usual,
-            critic_iterations=min(usual.critic_iterations, QUICK_ITERATIONS),
-            actor_iterations=min(usual.actor_iterations, QUICK_ITERATIONS),
-        )
-        twinning = dataclasses.replace(twinning, learner=learner)
-        return dataclasses.replace(
-            self,
-            quick=False,
-            episodes=min(self.episodes, QUICK_EPISODES),
-            unseen=min(self.unseen, QUICK_UNSEEN),
-            real_unseen=min(self.real_unseen, QUICK_UNSEEN),
-            twinning=twinning,
-        )
+        if self.quick:
+            iterations = {
+                name: min(getattr(twinning.learner, name), QUICK_ITERATIONS)
+                for name in ("critic_iterations", "actor_iterations")
+            }
+            twinning = dataclasses.replace(twinning, learner=dataclasses.replace(twinning.learner, **iterations))
+            greatest = {"episodes": QUICK_EPISODES, "unseen": QUICK_UNSEEN, "real_unseen": QUICK_UNSEEN}
+            least = {name: min(getattr(self, name), number) for name, number in greatest.items()}
+        return dataclasses.replace(self, quick=False, twinning=twinning, **least)
 
 
 @runtime_checkable
@@ -264,7 +254,8 @@ def plant_of(config: RunConfig) -> Plant:
     """
     if not isinstance(config, MakesPlant):
         raise ValueError(
-            f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one."
+            f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one, as "
+            "docs/own_plant.md shows, or give load_run the plant, load_run(folder, plant=...)."
         )
     return config.plant()
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import nn
@@ -14,7 +13,6 @@ from rt_torchrl.evaluation.unseen import Baseline, RealController
 from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
 from rt_torchrl.runs.run_folder import checkpoints
@@ -81,64 +79,49 @@ def twin_of(config: RunConfig, physics: Plant, closure: nn.Module, first: Start 
 
 
 def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
+    where = f"start={str(folder)!r} is a run"
     name = read_settings(folder)["plant"]
     if name != plant.name:
-        raise ValueError(f"start={str(folder)!r} is a run of plant {name!r}, this run is of plant {plant.name!r}.")
+        raise ValueError(f"{where} of plant {name!r}, this run is of plant {plant.name!r}.")
     kind = type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
     for what in ("observations", "actions"):
-        earlier, present = (_described(getattr(physics, what)) for physics in (run.physics, plant))
+        earlier, present = (
+            [(signal.name, signal.unit, signal.low, signal.high) for signal in getattr(physics, what)]
+            for physics in (run.physics, plant)
+        )
         if earlier != present:
             raise ValueError(
-                f"start={str(folder)!r} is a run whose {what} are {', '.join(map(str, earlier))}; here they are "
+                f"{where} whose {what} are {', '.join(map(str, earlier))}; here they are "
                 f"{', '.join(map(str, present))}. Give the options of that run, such as --observe, or another start."
             )
-    _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
-    hypotheses = _hypotheses(folder, run.twin, config, plant)
+    closure = config.make_closure(plant, torch.Generator())
+    try:
+        closure.load_state_dict(run.closure.state_dict())
+    except RuntimeError as error:
+        raise ValueError(
+            f"{where} whose closure does not fit that of this run: {error}. Give its --closure."
+        ) from error
+    twin, hypotheses = make_twin(plant, closure, config.twinning.hypotheses), None
+    if isinstance(run.twin, TwinEnsemble) and isinstance(twin, TwinEnsemble):
+        hypotheses = run.twin.state_dict()["hypotheses"]
+        try:
+            twin.load_hypotheses(hypotheses)
+        except ValueError as error:
+            if run.twin.hypothesis is not None:
+                raise ValueError(
+                    f"{where} that believes {run.twin.hypothesis!r}, but {error} Give the "
+                    "--twinning.hypotheses.which of that run, or none to plan on the twin alone."
+                ) from error
+            hypotheses = None
     arm, live = run.config.twinning.arm, run.live
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
-        return EarlierPolicies(
-            {role: policy.to(config.device) for role, policy in policies.items()},
-            run.closure.to(config.device),
-            live,
-            hypotheses,
-        )
+        on_device = {role: policy.to(config.device) for role, policy in policies.items()}
+        return EarlierPolicies(on_device, run.closure.to(config.device), live, hypotheses)
 
     return start
-
-
-def _described(signals: tuple[Signal, ...]) -> list[Any]:
-    """What two policies must agree about: names, units and ranges of signals."""
-    return [(signal.name, signal.unit, signal.low, signal.high) for signal in signals]
-
-
-def _require_same_closure(folder: Path, earlier: nn.Module, present: nn.Module) -> None:
-    shapes = [{name: weight.shape for name, weight in closure.state_dict().items()} for closure in (earlier, present)]
-    if type(earlier) is not type(present) or shapes[0] != shapes[1]:
-        raise ValueError(
-            f"start={str(folder)!r} is a run whose twin has a closure {type(earlier).__name__}, which does not fit the "
-            f"{type(present).__name__} of this run; give that run's --closure."
-        )
-
-
-def _hypotheses(folder: Path, earlier: DigitalTwin, config: RunConfig, plant: Plant) -> dict[str, Any] | None:
-    """The hypotheses of a run, where this run has some, too: the same ones, or else the run believed none."""
-    twin = make_twin(plant, config.make_closure(plant, torch.Generator()), config.twinning.hypotheses)
-    if not isinstance(earlier, TwinEnsemble) or not isinstance(twin, TwinEnsemble):
-        return None
-    hypotheses: dict[str, Any] = earlier.state_dict()["hypotheses"]
-    try:
-        twin.load_hypotheses(hypotheses)
-    except ValueError as error:
-        if earlier.hypothesis is None:
-            return None
-        raise ValueError(
-            f"start={str(folder)!r} is a run that believes {earlier.hypothesis!r}, but {error} Give the "
-            "--twinning.hypotheses.which of that run, or --twinning.hypotheses.which none to plan on the twin alone."
-        ) from error
-    return hypotheses
 
 
 def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
@@ -175,7 +158,7 @@ def known_physics(
             states that no sensor of the real system reads, or lacks some that one reads.
     """
     require_plant("plant", plant)
-    require_simulation(config, plant, real, baselines)
+    _require_simulation(config, real, baselines, wears=config.wear(plant) is not None)
     believed = config.believed()
     physics = plant if believed is None else believed
     require_plant("config.believed()", physics)
@@ -196,33 +179,29 @@ def known_physics(
     return physics
 
 
-def require_simulation(
-    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
+def _require_simulation(
+    config: RunConfig, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None, *, wears: bool
 ) -> None:
-    """Refuse options that only a plant in simulation can carry out, and controllers that need the other kind of system.
+    """Refuse options and controllers that need the other kind of system: a plant in simulation, or a real one.
 
     Raises:
         ValueError: if there is such an option or controller; it names it.
     """
-    if env is not None and (config.noise or config.wear(plant) is not None):
+    unknown = env is not None and env.closure is None
+    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
+    if env is not None and (config.noise or wears):
         raise ValueError(f"noise={config.noise}, or wear, needs a plant in simulation; this run has a real system.")
     if env is None and config.real_unseen:
         raise ValueError(
             f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
             "its own; leave it out, and unseen says how many episodes are simulated."
         )
-    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
-    if real and (env is None or env.closure is not None):
+    if real and not (unknown and config.real_unseen):
         raise ValueError(
-            f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
-            "Give ClassicalController classes, or a RealSystem without its closure."
+            f"baselines {real} can only be flown on the real system: give a RealSystem without its closure, and "
+            "real_unseen, the number of episodes that each may fly, or leave them out."
         )
-    if real and not config.real_unseen:
-        raise ValueError(
-            f"baselines {real} can only be flown on the real system, which flies nothing after the training with "
-            "real_unseen=0; say how many episodes each may fly, such as real_unseen=5, or leave them out."
-        )
-    if env is not None and env.closure is None and config.reference:
+    if unknown and config.reference:
         raise ValueError(
             f"reference={config.reference} is computed on the plant under the true closure, and the real system's is "
             "not known; leave it out, or give the RealSystem its closure."
