@@ -32,8 +32,7 @@ class Config:
 
     Args:
         log: CSV or Parquet file with a column for the time, each action, each exogenous input and each measured state.
-        plant: plant of the log, as the name of a folder under envs, or as FILE.py:NAME or package.module:NAME of your
-            own.
+        plant: plant of the log, as the name of a folder under envs, or as FILE.py:NAME of your own.
         columns: columns with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
             HEADER=SIGNAL*FACTOR+OFFSET.
         drop: leave out rows with a value that is missing or out of range; they become gaps.

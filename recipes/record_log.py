@@ -37,12 +37,12 @@ Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 class Config:
     """Fly one episode of a plant and write the log that a data logger would write.
 
-    The classical controller of turbine, drone and tank acts, also where FILE.py:NAME or package.module:NAME gives the
+    The classical controller of turbine, drone and tank acts, also where FILE.py:NAME gives the
     plant; on any other plant a policy with random first weights does.
 
     Args:
         log: log file to write, CSV or Parquet.
-        plant: name of a folder under envs, or FILE.py:NAME or package.module:NAME of your own plant.
+        plant: name of a folder under envs, or FILE.py:NAME of your own plant.
         states: names of the states that are logged; by default all.
         seed: seed of the episode and of a policy's first weights.
         horizon: length of the episode [s]; by default the plant's.

@@ -301,7 +301,7 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tm
         ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
         ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
         ({"dt": 60.0}, "unstable"),
-        ({"plant": "rt_torchrl:Signal"}, "plant='rt_torchrl:Signal' is no class derived from Plant"),
+        ({"plant": "rt_torchrl:Signal"}, "rt_torchrl does not exist; give a file with Python code"),
         ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
 )

@@ -24,7 +24,7 @@ from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.console import HELP, PACKAGE
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import BESIDE, FILE, OF_THE_CALL, as_written, module_of, named, require_config
+from rt_torchrl.runs.settings import BESIDE, FILE, OF_THE_CALL, as_written, attribute, module_of, require_config
 
 Configuration = TypeVar("Configuration")
 
@@ -184,20 +184,17 @@ def plant_class(name: str) -> type[Plant]:
     """The plant class that a name stands for.
 
     Args:
-        name: folder of the plant under ``rt_torchrl.envs``, or ``FILE.py:NAME`` or ``package.module:NAME``.
+        name: folder of the plant under ``rt_torchrl.envs``, or ``FILE.py:NAME``.
 
     Raises:
         ValueError: if there is no such plant.
     """
+    file, _, own = name.rpartition(":")
     plants = shipped_plants()
-    if ":" not in name:
-        if name not in plants:
-            raise ValueError(
-                f"plant={name!r} does not exist; choose one of {', '.join(plants)}, or name one of your own as "
-                "FILE.py:NAME or package.module:NAME."
-            )
-        return plants[name]
-    kind = named(name)
+    kind = attribute(module_of(Path(file)), own) if file else plants.get(name)
     if not (inspect.isclass(kind) and issubclass(kind, Plant)):
-        raise ValueError(f"plant={name!r} is no class derived from Plant.")
+        raise ValueError(
+            f"plant={name!r} does not exist; choose one of {', '.join(plants)}, or name a class derived from Plant as "
+            "FILE.py:NAME."
+        )
     return kind

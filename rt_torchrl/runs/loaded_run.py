@@ -119,7 +119,8 @@ class LoadedRun:
         believed = self.twin.believed
         plant, closure = (self.plant, self.true_closure()) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
-        batches = [len(given) for given, rank in ((exogenous, 2), (initial_state, 1)) if _is_batch(given, rank)]
+        ranks = ((exogenous, 2), (initial_state, 1))
+        batches = [len(given) for given, rank in ranks if given is not None and given.dim() > rank]
         count = max(batches, default=1)
         # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
         start = plant.draw_initial_state(count, generator)
@@ -323,13 +324,9 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
     return load_recipe(Path(recipe)).Config
 
 
-def _is_batch(given: Tensor | None, rank: int) -> bool:
-    return given is not None and given.dim() > rank
-
-
 def _rows(name: str, given: Tensor, rank: int, count: int, widths: Sequence[int]) -> Tensor:
     """What is given of one episode or of each, in double precision with a batch dimension of ``count``."""
-    rows = given if _is_batch(given, rank) else given[None]
+    rows = given if given.dim() > rank else given[None]
     if rows.dim() != rank + 1 or not rows.numel() or rows.shape[-1] not in widths or len(rows) not in (1, count):
         columns = " or ".join(map(str, dict.fromkeys(widths)))
         raise ValueError(

@@ -264,25 +264,6 @@ def module_of(file: Path) -> ModuleType:
     return module
 
 
-def named(target: str) -> Any:
-    """The object that ``FILE.py:NAME`` or ``package.module:NAME`` names.
-
-    Raises:
-        ValueError: if there is no such file or module, or it does not define the name.
-    """
-    place, colon, name = target.rpartition(":")
-    if not (colon and place and name):
-        raise ValueError(f"{target!r} is not understood; write FILE.py:NAME or package.module:NAME.")
-    if place.endswith(".py"):
-        return attribute(module_of(Path(place)), name)
-    try:
-        return attribute(importlib.import_module(place), name)
-    except ImportError as error:
-        raise ValueError(
-            f"{target!r} cannot be imported ({error}); install its package, or give its file as FILE.py:{name}."
-        ) from error
-
-
 def attribute(module: ModuleType, name: str) -> Any:
     """The object that a module defines under a name, which may have dots.
 
