@@ -32,18 +32,17 @@ class Interruption:
 
     def __enter__(self) -> "Interruption":
         Interruption._pending = self.at_once = False
-        main = threading.current_thread() is threading.main_thread()
-        self._before = {number: signal.getsignal(number) for number in SIGNALS if main}
-        for number, handler in self._before.items():
-            if handler in UNTOUCHED:
-                signal.signal(number, self._handle)
+        self._before = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if signal.getsignal(number) in UNTOUCHED:
+                    self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *error: object) -> None:
         Interruption._pending = False
         for number, handler in self._before.items():
-            if handler in UNTOUCHED:
-                signal.signal(number, handler)
+            signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if Interruption._pending:

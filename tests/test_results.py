@@ -123,8 +123,6 @@ def stopped(tmp_path_factory):
 
 def test_tensorboard_has_the_final_costs_and_the_table(stopped):
     tags = EventAccumulator(str(stopped[0])).Reload().Tags()
-    assert {"unseen episodes/J_p", "unseen episodes/J_a model_based"} <= set(tags["histograms"])
-    assert any(name.startswith("model_free/") for name in tags["histograms"])
     assert "final/J_a live" in tags["scalars"] and "results/text_summary" in tags["tensors"]
 
 

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
-from rt_torchrl.steps.config import ROLES, Role
+from rt_torchrl.steps.config import ROLES
 from rt_torchrl.systems.operation import FIRST
 
 GROUPS = {
@@ -21,10 +20,6 @@ GROUPS = {
     "twin": ("J_p", "paired_difference", "alarm", "closure_"),
 }
 """Groups of curves, with what the names of their entries in ``metrics.json`` begin with; others are of the steps."""
-
-
-BINS = "sturges"
-"""Rule for the bins of a histogram; TensorBoard's own ones end at 1e20, and refuse what lies beyond."""
 
 
 class Dashboard:
@@ -46,32 +41,16 @@ class Dashboard:
         """
         for name, value in final_costs(summary).items():
             self._writer.add_scalar(f"final/{name}", value, 0)
-        unseen = summary["unseen"]
-        histograms = {"J_p": unseen["J_p_each"]} | {f"J_a {name}": costs for name, costs in unseen["costs"].items()}
-        for name, costs in histograms.items():
-            if None not in costs:  # which stands for a cost that is not finite
-                self._writer.add_histogram(f"unseen episodes/{name}", np.asarray(costs), 0, bins=BINS)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
-    def episode(self, record: Mapping[str, Any], policies: Mapping[Role, nn.Module]) -> None:
-        """Write the scalars and the words of an episode, and the weights after it.
-
-        Args:
-            record: entry of the episode in ``metrics.json``.
-            policies: both policies by role.
-        """
-        step = record["episode"]
+    def episode(self, record: Mapping[str, Any]) -> None:
+        """Write the scalars and the words of an episode, an entry in ``metrics.json``."""
         for tag, value in scalars_of(record).items():
-            self._writer.add_scalar(tag, value, step)
+            self._writer.add_scalar(tag, value, record["episode"])
         for tag, key in (("alarm", "warning"), ("believed", "believed")):
             if record.get(key):
-                self._writer.add_text(tag, str(record[key]), step)
-        weights = {f"closure/{name}": w for name, w in (record["closure"] or {}).items() if not isinstance(w, float)}
-        for role, policy in policies.items():
-            weights |= {f"{role}/{name}": weight.detach().cpu() for name, weight in policy.named_parameters()}
-        for name, values in weights.items():
-            self._writer.add_histogram(name, np.ravel(values), step, bins=BINS)
+                self._writer.add_text(tag, str(record[key]), record["episode"])
 
     def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""

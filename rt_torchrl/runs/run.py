@@ -287,7 +287,7 @@ class Run:
             record[key] = self.unseen.control_costs(acting).mean().item()
         save_checkpoint(self.folder, self.algorithm, [*self.episodes, record])
         self.episodes.append(record)
-        dashboard.episode(record, self.algorithm.policies)
+        dashboard.episode(record)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""

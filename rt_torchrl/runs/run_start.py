@@ -86,10 +86,7 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
     kind = type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
     for what in ("observations", "actions"):
-        earlier, present = (
-            [(signal.name, signal.unit, signal.low, signal.high) for signal in getattr(physics, what)]
-            for physics in (run.physics, plant)
-        )
+        earlier, present = getattr(run.physics, what), getattr(plant, what)
         if earlier != present:
             raise ValueError(
                 f"{where} whose {what} are {', '.join(map(str, earlier))}; here they are "
