@@ -327,7 +327,7 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
 def _rows(name: str, given: Tensor, rank: int, count: int, widths: Sequence[int]) -> Tensor:
     """What is given of one episode or of each, in double precision with a batch dimension of ``count``."""
     rows = given if given.dim() > rank else given[None]
-    if rows.dim() != rank + 1 or not rows.numel() or rows.shape[-1] not in widths or len(rows) not in (1, count):
+    if rows.dim() != rank + 1 or 0 in rows.shape[:-1] or rows.shape[-1] not in widths or len(rows) not in (1, count):
         columns = " or ".join(map(str, dict.fromkeys(widths)))
         raise ValueError(
             f"{name} of shape {tuple(given.shape)} must have {rank} dimensions, the last of {columns}, or a batch of "
