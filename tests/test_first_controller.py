@@ -162,8 +162,7 @@ def test_a_run_is_not_resumed_with_another_controller_whose_flights_it_lacks(tmp
     with pytest.raises(ValueError, match="classical controller.*first.class is Quick here and was PD in the run"):
         resume(type("Quick", (PD,), {}))
     monkeypatch.setattr(PD, "default_gains", (0.3, 0.6))
-    message = r"first.K_2 is \[0.6\] here and was \[0.3\] in the run. Its flights .*a new run by --start"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"first.K_2 is \[0.6\] here and was \[0.3\] in the run.* by --start"):
         resume(PD)
     monkeypatch.undo()
     small_run(tmp_path, 1, parts={"first": PD, "baselines": {"new": PD}}, resume=True).train()

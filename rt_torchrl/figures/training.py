@@ -99,7 +99,7 @@ def exogenous(snapshot: Snapshot) -> Figure:
     for k, signal in enumerate(signals):
         above, below = axes[k::columns]
         above.plot(time[:-1], recorded[:, k], color=REAL, linewidth=1.0, label="recorded")
-        for sample, label in zip(samples, (f"{len(samples)} samples", "_", "_"), strict=True):
+        for sample, label in zip(samples, (f"{len(samples)} samples", "_", "_"), strict=False):
             below.plot(time[:-1], sample[:, k], color=style.SAMPLES, linewidth=0.8, label=label)
         for ax in (above, below):
             ax.plot(time[:-1], mean[:, k], color=style.LARGE_SCALE, linewidth=2.2, label="large scale (SVR)")

@@ -185,21 +185,17 @@ def require_same(folder: Path, config: RunConfig, controllers: Mapping[str, Any]
     """
     settings = read_settings(folder)
     earlier: dict[str, Any] = settings.get(CONTROLLERS, {})
-    if changed := changes(earlier, controllers, earlier.keys() ^ controllers.keys()):
+    changed = changes(earlier, controllers, earlier.keys() ^ controllers.keys())
+    changed += differences(folder, config, HARMLESS if settings.get("unseen_every") else HARMLESS | {"unseen"})
+    if changed:
         raise ValueError(
-            f"log_dir={folder} is to be resumed with another classical controller than its own: {'; '.join(changed)}. "
-            f"Its flights tell nothing of this one: give it what it was in the run, or begin a new run by --start "
-            f"{folder}, which takes policies and twin of the run, when it is finished, without its flights."
-        )
-    harmless = HARMLESS if settings.get("unseen_every") else HARMLESS | {"unseen"}
-    if changed := differences(folder, config, harmless):
-        raise ValueError(
-            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(changed)}. Give the run's "
-            "own options, or another folder for a new run."
+            f"log_dir={folder} is to be resumed with other options or another classical controller than its own: "
+            f"{'; '.join(changed)}. Give the run's own, or another folder for a new run, which takes policies and twin "
+            f"of this one by --start {folder}."
         )
 
 
-def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str] = HARMLESS) -> list[str]:
+def differences(folder: Path, config: RunConfig, harmless: AbstractSet[str]) -> list[str]:
     """What differs between the options of a run and those that are asked for, in words.
 
     Args:
