@@ -30,7 +30,7 @@ from rt_torchrl.interruption import Interrupted, termination_as_interrupt
 from rt_torchrl.options import AtLeastOne, Count
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.compare import FinishedRun, Row, markdown, with_interval
-from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of, worn_closure
+from rt_torchrl.runs.run_config import MakesPlant, physics_of, plant_of
 from rt_torchrl.runs.settings import FILE, HARMLESS, as_written, differences, read_settings, settings_of, task_of
 from rt_torchrl.steps.config import Arm
 
@@ -242,8 +242,7 @@ class Search:
         of = {"recipe": str(self.recipe.resolve()), "effort": self.effort, "unseen": config.unseen}
         of |= {"policy": config.policy, "hidden": config.hidden}
         of |= {"observations": [signal.name for signal in physics_of(config).observations]}
-        worn = {} if config.wear(plant_of(config)) is None else {"episodes": config.episodes, "start": config.start}
-        return of | task_of(as_written(config)) | worn
+        return of | task_of(as_written(config))
 
     @functools.cached_property
     def path(self) -> Path:
@@ -267,7 +266,7 @@ class Search:
         config = options_of(self.recipe, self.words).effective()
         plant, physics = plant_of(config), physics_of(config)
         episodes = UnseenEpisodes(plant, config.unseen)
-        episodes.physics, episodes.closure = physics, worn_closure(config, plant, config.episodes)
+        episodes.physics = physics
         best = exact_optimum(episodes, functools.partial(config.make_policy, physics), **self.effort)
         optimum = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients, "J_a_of_each_start": best.costs}
         self.place.mkdir(parents=True, exist_ok=True)

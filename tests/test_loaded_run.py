@@ -9,10 +9,9 @@ import typing
 
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import drawn
 from small_runs import SMALL, small_run
-from test_classical import PD
 from test_documentation import leave_finished_run
 from test_early_ends import Falling
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
@@ -23,10 +22,8 @@ from rt_torchrl import HypothesesConfig, RunConfig, SaturatedMLP, load_run
 from rt_torchrl.runs import settings as settings_module
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.steps import interact
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.imitation import clones
-from rt_torchrl.systems.sound_part import SoundPart, sound_part
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
 WITHOUT_NEURAL_CLOSURE = ("pendulum",)
@@ -177,28 +174,6 @@ def test_a_file_of_the_run_folder_is_not_run(file, evil):
         with pytest.raises(ValueError, match=r"is not run.*give the recipe"):
             load_run(folder, plant=LinearQuadratic())
     assert not mark.exists()
-
-
-class Worn(RunConfig):
-    """The real system loses a tenth of its stiffness in every episode."""
-
-    def wear(self, plant):
-        weights = torch.tensor(LinearQuadratic.true_closure, dtype=torch.float64)
-        return lambda episode: LinearClosure(0.9**episode * weights)
-
-
-@pytest.mark.parametrize("start", ["random", "controller"])
-def test_the_true_closure_is_that_of_the_end_of_the_training(tmp_path, start, monkeypatch):
-    """The flight that is imitated and a refused one wear the system, too; episodes that were not made do not."""
-    parts = {"callbacks": [lambda episodes: "enough" if len(episodes) == 2 else None]}
-    parts |= {"first": PD} if start == "controller" else {}
-    run = small_run(tmp_path, 5, config=Worn, parts=parts, start=start)
-    refused = SoundPart([], [], "refused by the test", whole=False)
-    answers = [*(start != "random") * [None], None, refused, None]
-    monkeypatch.setattr(interact, "sound_part", lambda *given: answers.pop(0) or sound_part(*given))
-    assert run.train()["episodes"][-1]["episodes_refused"] == 1 and not answers
-    found = load_run(tmp_path, Worn, plant=LinearQuadratic(horizon=2.0)).true_closure()
-    assert torch.equal(found.matrix, run.unseen.closure.matrix)
 
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):

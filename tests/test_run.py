@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from small_runs import FULL, SMALL, believing, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
@@ -16,7 +16,6 @@ from torchrl.collectors import Collector
 
 import rt_torchrl as rt
 from rt_torchrl import figures as drawings
-from rt_torchrl.figures import style
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
@@ -55,14 +54,6 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert metrics["episodes"][3]["J_a_unseen"] == pytest.approx(mean, rel=1e-14)
 
 
-class Worn(rt.RunConfig):
-    """The real system loses its own stiffness from the second episode on."""
-
-    def wear(self, plant):
-        worn = LinearClosure(torch.zeros(2, 2))
-        return lambda episode: plant.closure if episode < 1 else worn
-
-
 def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
     """Nothing moves after an early end, whatever a policy asks for."""
     shown, draw, plant = {}, drawings.flights, Falling()
@@ -81,18 +72,6 @@ def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
     (flown,) = shown.values()
     *going_on, ended = plant.ended(flown.states).tolist()
     assert len(flown.actions) < plant.n_steps and ended and not any(going_on)
-
-
-def test_the_twin_follows_a_system_that_wears(tmp_path):
-    twinning = dataclasses.replace(SMALL, records=1)
-    run = small_run(tmp_path, plant=LinearQuadratic(horizon=4.0), config=Worn, twinning=twinning)
-    found = run.train()
-    closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]
-    # What one record of 40 samples shows of four weights, without noise: to rounding.
-    torch.testing.assert_close(closures[0], torch.tensor(LinearQuadratic.true_closure), rtol=0, atol=1e-6)
-    assert closures[1].abs().max() < 1e-6 and closures[2].abs().max() < 1e-6
-    assert found["summary"]["closure"]["true"] == {"matrix": [[0.0, 0.0], [0.0, 0.0]]}
-    assert not style.closures(rt.Snapshot.take(run.algorithm, run.initial_closure, []))["true"].matrix.any()
 
 
 def test_a_twin_may_believe_in_another_plant(tmp_path):

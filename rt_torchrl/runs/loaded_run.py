@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.fit.log import READERS
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
@@ -98,8 +97,7 @@ class LoadedRun:
             policy: policy of an observation, such as ``run.policy("model_based")``, or a :class:`ClassicalController`.
             exogenous: exogenous inputs, ``*batch n n_z``, a row for each control interval; None draws an episode.
             initial_state: states to start from, ``*batch n_s``, or those of them that sensors read; None draws them.
-            on: real for the system with its true closure as it is at the end of the training, or twin for the twin
-                that is most likely to be right.
+            on: real for the system with its true closure, or twin for the twin that is most likely to be right.
             seed: seed of what is drawn.
 
         Raises:
@@ -117,7 +115,7 @@ class LoadedRun:
                 "on='twin'."
             )
         believed = self.twin.believed
-        plant, closure = (self.plant, self.true_closure()) if on == "real" else (believed.plant, believed.closure)
+        plant, closure = (self.plant, self.plant.closure) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
         ranks = ((exogenous, 2), (initial_state, 1))
         batches = [len(given) for given, rank in ranks if given is not None and given.dim() > rank]
@@ -170,18 +168,6 @@ class LoadedRun:
             raise ValueError(f"role={role!r} does not exist in this run; choose {known}, or run.live.")
         return self.policies[role]
 
-    def true_closure(self) -> nn.Module:
-        """The closure of ``plant`` at the end of the training: a system that wears is not what it was."""
-        wear, episodes = self.config.wear(self.plant), self.metrics["episodes"]
-        if wear is None:
-            return self.plant.closure
-        # Flights that were refused wear the system, too; in an asynchronous run an episode has several windows.
-        flights = sum(entry.get("windows", 1) + entry.get("episodes_refused", 0) for entry in episodes)
-        # What is imitated has flown once before, unless its flights are those of a log.
-        flown_first = any("start_cost" in entry for entry in episodes)
-        recorded = Path(self.config.start or "").suffix.lower() in READERS
-        return wear(int(flights) + (flown_first and not recorded) - 1)
-
     def _figures(self, flown: Trajectory | None) -> dict[str, "Figure"]:
         """Every figure of a finished run by name, with an episode of its own; see :meth:`LoadedRun.figure`."""
         from rt_torchrl import figures  # here, because Matplotlib takes long to load
@@ -212,7 +198,7 @@ class LoadedRun:
             process = ExogenousProcess.of(inputs[:, : len(signals)], dt=self.physics.dt, signals=signals, config=given)
         return Snapshot(
             plant=self.physics,
-            true_closure=None if self._only_on_the_twin else self.true_closure(),
+            true_closure=None if self._only_on_the_twin else self.plant.closure,
             closure=self.twin.believed_law,
             initial_closure=self.initial_closure,
             policies={role: self.policy(role) for role in ("model_free", "model_based")},

@@ -30,13 +30,12 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 def simulated(
     plant: Plant, config: RunConfig, first: type[ClassicalController] | None, *, device: torch.device
 ) -> EnvBase:
-    """The real system in simulation, with the sensors and the wear of the configuration.
+    """The real system in simulation, with the sensors of the configuration.
 
     With limits it is behind a safety layer, whose fallback is the controller that the real system has had so far, or
     the action nearest to zero within the limits.
     """
-    wear = config.wear(plant)
-    env = PlantEnv(plant, seed=config.seed, device=device, noise=config.noise, wear=wear)
+    env = PlantEnv(plant, seed=config.seed, device=device, noise=config.noise)
     if not config.twinning.limits:
         return env
     limits = OperatingLimits(plant, config.twinning.limits)
@@ -56,9 +55,11 @@ def judged_on(
 
     Policies for them are made for the physics that the twin knows, and leaving the bounds of states counts.
     """
-    if env is None or env.closure is not None:
+    if env is None:
         unseen = UnseenEpisodes(plant, config.unseen, device=device)
-        unseen.judged_on = "simulation" if env is None else "simulation of the real system"
+    elif env.closure is not None:
+        unseen = UnseenEpisodes(plant, config.unseen, device=device)
+        unseen.closure, unseen.judged_on = env.closure, "simulation of the real system"
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
     unseen.physics, unseen.bounds = twin.plant, StateBounds(plant.readings, config.twinning.limits.states)

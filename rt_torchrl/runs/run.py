@@ -233,7 +233,6 @@ class Run:
             self._end_operation()
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
-            self._follow_wear()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
@@ -281,18 +280,12 @@ class Run:
                 bar.write(f"episode {record['episode']}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         interval = self.config.unseen_every
         if interval and number % interval == 0:
-            self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
             record[key] = self.unseen.control_costs(acting).mean().item()
         save_checkpoint(self.folder, self.algorithm, [*self.episodes, record])
         self.episodes.append(record)
         dashboard.episode(record)
-
-    def _follow_wear(self) -> None:
-        """Give the unseen episodes the real system's present closure, if it is known."""
-        if self.algorithm.env.closure is not None:
-            self.unseen.closure = self.algorithm.env.closure
 
     def _fly_the_real_system(self, bar: Progress) -> dict[str, Any] | None:
         """The entry ``real_unseen`` of the summary, if flights of the real system were asked for.

@@ -214,13 +214,6 @@ class RunConfig:
             defaults = dataclasses.replace(defaults, twinning=dataclasses.replace(defaults.twinning, planner=planner))
         return defaults
 
-    def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
-        """Function from an episode's number to the real system's closure; None if the real system does not wear.
-
-        Override this method for a system that wears.
-        """
-        return None
-
     def effective(self) -> "RunConfig":
         """The options that the run carries out, in which ``start`` and ``quick`` have replaced other options."""
         twinning, least = self.twinning, {}
@@ -263,12 +256,6 @@ def plant_of(config: RunConfig) -> Plant:
 def physics_of(config: RunConfig) -> Plant:
     """The physics of the twin, by which policies and controllers are made: what is believed, or the real system's."""
     return config.believed() or plant_of(config)
-
-
-def worn_closure(config: RunConfig, plant: Plant, episodes: int) -> nn.Module:
-    """The real system's closure after training episodes, and the flight of a controller that they began with."""
-    wear, flights = config.wear(plant), episodes + (config.start in ("controller", "mpc"))
-    return plant.closure if wear is None else wear(flights - 1)
 
 
 def require_plant(argument: str, given: object) -> None:

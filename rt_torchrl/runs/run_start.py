@@ -155,7 +155,7 @@ def known_physics(
             states that no sensor of the real system reads, or lacks some that one reads.
     """
     require_plant("plant", plant)
-    _require_simulation(config, real, baselines, wears=config.wear(plant) is not None)
+    _require_simulation(config, real, baselines)
     believed = config.believed()
     physics = plant if believed is None else believed
     require_plant("config.believed()", physics)
@@ -176,9 +176,7 @@ def known_physics(
     return physics
 
 
-def _require_simulation(
-    config: RunConfig, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None, *, wears: bool
-) -> None:
+def _require_simulation(config: RunConfig, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None) -> None:
     """Refuse options and controllers that need the other kind of system: a plant in simulation, or a real one.
 
     Raises:
@@ -186,8 +184,8 @@ def _require_simulation(
     """
     unknown = env is not None and env.closure is None
     real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
-    if env is not None and (config.noise or wears):
-        raise ValueError(f"noise={config.noise}, or wear, needs a plant in simulation; this run has a real system.")
+    if env is not None and config.noise:
+        raise ValueError(f"noise={config.noise} needs a plant in simulation; this run has a real system.")
     if env is None and config.real_unseen:
         raise ValueError(
             f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
