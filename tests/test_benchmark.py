@@ -81,29 +81,6 @@ def trained(name, folder, *options):
     return summary, {who: flights["J_a"]["mean"] for who, flights in flown.items()}
 
 
-REACTOR = """
-import sys
-from pathlib import Path
-sys.path.insert(0, "tests")
-import peers
-comparison = peers.Comparison("reactor", Path(), judged=2)
-learned = comparison.learned(0, "SAC", episodes=2)
-print(comparison.true(0).cost, comparison.data_sheet(0).cost, comparison.classical(0).cost, learned.cost)
-assert learned.episodes == 2 and learned.paid > 0.0, learned
-"""
-
-
-@pytest.mark.nightly
-def test_the_peers_of_the_reactor_cost_what_they_know():
-    """do-mpc needs the true coefficients, PI has gains for the reactor, and two episodes teach nobody anything."""
-    for package in ("pcgym", "do_mpc", "stable_baselines3"):
-        pytest.importorskip(package, reason="the group nightly is not installed")
-    done = fresh_process.run(REACTOR)
-    assert done.returncode == 0, done.stderr[-3000:]
-    true, data_sheet, classical, learned = map(float, done.stdout.splitlines()[-1].split())
-    assert true < classical < data_sheet < learned
-
-
 @pytest.mark.nightly
 def test_the_reactor_is_held_better_than_by_its_controller(tmp_path):
     pytest.importorskip("pcgym", reason="the extra process is not installed")

@@ -153,12 +153,6 @@ def test_first_guess_of_the_polar_is_within_half_of_the_truth(plant):
 # Control problem
 
 
-def test_observation_is_the_scaled_error(plant):
-    observation = plant.observe(double(0.0).squeeze(), double(1.0, 7.0, 2.0, -3.0), double(1.0))
-    expected = double(4.0, -2.0, -2.0, 3.0) / double(2.0, 2.0, 1.0, 1.0)
-    torch.testing.assert_close(observation, expected)
-
-
 @pytest.mark.parametrize(
     "state, cost",
     [

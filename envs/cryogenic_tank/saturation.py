@@ -85,14 +85,12 @@ class Saturation(nn.Module):
         """Refuse pressures outside the range.
 
         Raises:
-            ValueError: if there is one; the message holds the worst of them and the range.
+            ValueError: if there is one.
         """
-        outside = ~self._within(p)
-        if outside.any():
-            offenders = p[outside]
-            worst = offenders[(offenders - 0.5 * (self.low + self.high)).abs().argmax()].item()
+        outside = p[~self._within(p)]
+        if len(outside):
             raise ValueError(
-                f"pressure p={worst / 1e3:g} kPa is outside the saturation table of {self.fluid}, "
+                f"pressure p={outside[0].item() / 1e3:g} kPa is outside the saturation table of {self.fluid}, "
                 f"{self.low / 1e3:g} … {self.high / 1e3:g} kPa."
             )
 

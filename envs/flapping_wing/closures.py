@@ -37,16 +37,10 @@ class QuasiSteadyPolar(PositiveCoefficients):
     true_coefficients = (1.71, 0.043, 1.595)
 
     @classmethod
-    def draw(cls, generator: torch.Generator, *, spread: float = 0.5) -> "QuasiSteadyPolar":
-        """A guess whose coefficients each miss the true ones by a factor uniform on [1 − spread, 1 + spread].
-
-        Raises:
-            ValueError: if ``spread`` is not in [0, 1), where all coefficients stay positive.
-        """
-        if not 0.0 <= spread < 1.0:
-            raise ValueError(f"spread={spread} of QuasiSteadyPolar must be in [0, 1), a fraction of the true values.")
+    def draw(cls, generator: torch.Generator) -> "QuasiSteadyPolar":
+        """A guess whose coefficients each miss the true ones by a factor uniform on [1/2, 3/2]."""
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
-        factor = 1.0 + spread * (2.0 * torch.rand(3, generator=generator, **like) - 1.0)
+        factor = 1.0 + 0.5 * (2.0 * torch.rand(3, generator=generator, **like) - 1.0)
         return cls(torch.tensor(cls.true_coefficients, **like) * factor)
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:

@@ -58,10 +58,10 @@ class SaintDrenan(nn.Module):
     def __init__(self, coefficients: Float[Tensor, "11"]):
         super().__init__()
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
-        if coefficients.shape != (11,) or not coefficients.isfinite().all():
-            raise ValueError(f"coefficients={coefficients.tolist()} must be 11 finite numbers: {', '.join(NAMES)}.")
-        if not coefficients[-1] > 1.0:
-            raise ValueError(f"x={coefficients[-1].item()} must be above 1; with less, C_p has no slope at β = 0.")
+        if coefficients.shape != (11,) or not coefficients.isfinite().all() or not coefficients[-1] > 1.0:
+            raise ValueError(
+                f"coefficients={coefficients.tolist()} must be 11 finite numbers, {', '.join(NAMES)}, with x above 1."
+            )
         self.register_buffer("scale", torch.tensor(self.scales, dtype=torch.float64))
         scaled = torch.cat([coefficients[:-1] / self.scale, torch.log((coefficients[-1:] - 1.0) / 0.5)])
         self.register_buffer("fixed", scaled[:1].clone())

@@ -2,14 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.options import Positive, Unbounded, configuration
@@ -69,16 +66,6 @@ class KaimalWind:
                 "lower it, or pass -math.inf for none."
             )
 
-    @property
-    def sigma(self) -> float:
-        """Target standard deviation σ = I·U [m/s]."""
-        return self.intensity * self.mean
-
-    def _unit_spectrum(self, f: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """S(f)/σ² [s] at frequencies f [Hz]; its integral over f > 0 is 1."""
-        transit = self.length_scale / self.mean
-        return 4.0 * transit / (1.0 + 6.0 * f * transit) ** (5.0 / 3.0)
-
     def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Wind speed u [m/s] of independent episodes, in float64 on the generator's device, by an inverse real FFT.
 
@@ -97,7 +84,9 @@ class KaimalWind:
         f = torch.arange(1, n_steps // 2 + 1, **like) / (n_steps * dt)
         phase = 2.0 * math.pi * torch.rand(batch, len(f), generator=generator, **like)
         # The fluctuation has unit variance, so that a wind without turbulence is not scaled by 0/0.
-        amplitude = torch.sqrt(2.0 * self._unit_spectrum(f) / (n_steps * dt))
+        transit = self.length_scale / self.mean
+        spectrum = 4.0 * transit / (1.0 + 6.0 * f * transit) ** (5.0 / 3.0)  # S/σ² [s], whose integral is 1
+        amplitude = torch.sqrt(2.0 * spectrum / (n_steps * dt))
         coefficients = torch.polar((0.5 * n_steps * amplitude).expand_as(phase), phase)
         if n_steps % 2 == 0:
             # irfft counts a pair ±f for every bin but the Nyquist bin, which stands alone; there it drops the imaginary
@@ -106,10 +95,10 @@ class KaimalWind:
             coefficients[:, -1] = 2.0 * coefficients[:, -1].real
         fluctuation = torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
         fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
-        return (self.mean + self.sigma * fluctuation).clamp_min(self.floor)
+        return (self.mean + self.intensity * self.mean * fluctuation).clamp_min(self.floor)
 
 
-@dataclass(frozen=True, kw_only=True)
+@configuration
 class RecordedWind:
     """Wind cut at random from records, such as TurbSim's files.
 
@@ -122,17 +111,11 @@ class RecordedWind:
         floor: least wind speed [m/s], to which slower wind is raised; ``-math.inf`` means no floor.
 
     Raises:
-        ValueError: if there is no record, or ``floor`` is not a number or is infinitely high.
+        ValueError: if there is no record, or ``floor`` is not a number.
     """
 
-    records: Sequence[WindRecord]
-    floor: float = CUT_IN_WIND
-
-    def __post_init__(self) -> None:
-        if len(self.records) == 0:
-            raise ValueError("records of RecordedWind is empty; pass at least one, for example from read_wind(path).")
-        if not self.floor < math.inf:
-            raise ValueError(f"floor={self.floor} m/s of RecordedWind must be a speed, or -math.inf for none.")
+    records: Annotated[Sequence[WindRecord], Field(min_length=1)]
+    floor: Unbounded = CUT_IN_WIND
 
     @property
     def mean(self) -> float:
