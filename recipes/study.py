@@ -125,11 +125,6 @@ class Config:
                     raise ValueError(f"arm {arm!r} of {system!r} is of another task; make it a system of its own.")
         return trainings
 
-    def search(self, training: "Training") -> "Search":
-        """The search for the optimum of the class of policies of a training."""
-        effort = QUICK_EFFORT if self.quick else {}
-        return Search(training.recipe, training.words, effort, self.log_dir / "optima")
-
 
 def named(text: str) -> tuple[str | None, list[str]]:
     """Name and words of ``NAME=WORDS``, or None and the words."""
@@ -250,13 +245,9 @@ class Search:
         digest = hashlib.sha256(json.dumps(self.of(), sort_keys=True).encode()).hexdigest()
         return self.place / f"{self.recipe.stem}-{digest[:12]}.json"
 
-    def kept(self) -> dict[str, Any] | None:
-        """What is kept, or None."""
-        return known(self.path)
-
     def finished(self) -> bool:
         """Whether the cost is kept."""
-        return self.kept() is not None
+        return known(self.path) is not None
 
     def run(self) -> None:
         """Compute the cost, unless it is kept."""
@@ -384,7 +375,8 @@ def studied(config: Config) -> tuple[list[rt.Comparison], list[str]]:
         places = {FinishedRun.read(training.folder).place for training in group if training.finished()}
         # Of a real system that nobody simulates, no gradients are known.
         if places == {"simulation"} and isinstance(group[0].config(), MakesPlant):
-            searches[key] = config.search(group[0])
+            effort = QUICK_EFFORT if config.quick else {}
+            searches[key] = Search(group[0].recipe, group[0].words, effort, config.log_dir / "optima")
     failures += run_all(list({search.path: search for search in searches.values()}.values()), **pool)
     return comparisons_of(trainings, searches), failures
 
@@ -403,7 +395,7 @@ def comparisons_of(
     }
     least: dict[Path, float] = {}
     for key, search in searches.items():
-        if finished[key] and (kept := search.kept()):
+        if finished[key] and (kept := known(search.path)):
             path, config = search.path, trainings[key][0].config()
             cost = math.inf if kept["J_a"] is None else kept["J_a"]
             # Model predictive control in the place of the model-based policy is of another class.

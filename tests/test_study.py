@@ -285,6 +285,7 @@ def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
         config = study.options_of(TINY, ("--twinning.planner.method", arm))
         training = SimpleNamespace(folder=folder, finished=lambda: True, config=lambda config=config: config)
         trainings["tiny", arm] = [training]
-        searches["tiny", arm] = SimpleNamespace(path=Path("same"), kept=lambda: {"J_a": 1.0})
+        searches["tiny", arm] = SimpleNamespace(path=tmp_path / "optimum.json")
+    (tmp_path / "optimum.json").write_text('{"J_a": 1.0}')
     (found,) = study.comparisons_of(trainings, searches)
     assert [row.optimum for row in found.rows] == [0.9] * 2

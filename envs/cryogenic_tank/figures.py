@@ -99,7 +99,9 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
         held.plot(1e-3 * array(drop), array(plant.held_load(state, action, closure)), **look)
     mean = record.exogenous.mean().item()
     held.axhline(mean, label="mean load of the last episode", **style.LIMIT_LINE)
-    visited = 1e-3 * array(_drop(plant, record.states[:-1], record.actions))
+    p = record.states[:-1, 2]
+    # The back pressure may leave less than the action.
+    visited = 1e-3 * array(p - plant.valve_outlet(p, plant.opening(record.actions[:, 0])[0]))
     for ax in (heat, held):
         style.veil(ax, kilopascal := 1e-3 * array(drop), (kilopascal >= visited.min()) & (kilopascal <= visited.max()))
     weight = np.full(len(visited), 100.0 / len(visited))
@@ -110,9 +112,3 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     share.set_xlim(0.0, 1e-3 * plant.actions[0].high)
     style.legend_below(figure, [held])
     return figure
-
-
-def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
-    p = states[:, 2]
-    return p - plant.valve_outlet(p, plant.opening(actions[:, 0])[0])
