@@ -144,10 +144,9 @@ def main(config: Config) -> None:
     from rt_torchrl.figures import save_figure
 
     make_folder("log_dir", config.log_dir)
-    benchmark = read_benchmark(config.data)
-    records = {"estimation": sensor_record_of(benchmark.voltage, benchmark.level)}
-    if config.test:
-        records["test"] = sensor_record_of(benchmark.test_voltage, benchmark.test_level)
+    records = {name: sensor_record_of(*columns) for name, columns in read_benchmark(config.data).items()}
+    if not config.test:
+        del records["test"]
     folds = cross_validated(records["estimation"], config)
     prior = min(config.priors, key=lambda prior: folds[f"{prior:g}"])
     law = physics([records["estimation"]], config)

@@ -20,13 +20,6 @@ from typing import Any, NamedTuple
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 
 
-class Row(NamedTuple):
-    """A row of the table: a recipe with its options."""
-
-    recipe: str
-    options: tuple[str, ...] = ()
-
-
 def planned(*options: str, episodes: int, unseen: int) -> tuple[str, ...]:
     """Options of the model-based half alone."""
     return ("--twinning.arm", "model_based", "--episodes", str(episodes), "--unseen", str(unseen), *options)
@@ -35,16 +28,17 @@ def planned(*options: str, episodes: int, unseen: int) -> tuple[str, ...]:
 SCHEDULED = ("--policy", "scheduled")
 VALVE = ("--command", "drop", "--end-weight", "0")
 HOP = ("--policy", "paper", "--task", "hop")
-ROWS = {
-    "turbine": Row("wind_turbine"),
-    "drone": Row("flapping_wing"),
-    "tank": Row("cryogenic_tank"),
-    "turbine, engineering": Row("wind_turbine", ("--task", "engineering")),
-    "turbine, pitch": Row("wind_turbine", planned(*SCHEDULED, "--unknown", "pitch", episodes=3, unseen=50)),
-    "turbine, inflow": Row("wind_turbine", planned(*SCHEDULED, "--unknown", "inflow", episodes=3, unseen=50)),
-    "tank, bias_15": Row("cryogenic_tank", planned(*VALVE, "--unknown", "bias_15", episodes=3, unseen=50)),
-    "hop, plane_6.3": Row("flapping_wing", planned(*HOP, "--unknown", "plane_6.3", episodes=10, unseen=192)),
+ROWS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "turbine": ("wind_turbine", ()),
+    "drone": ("flapping_wing", ()),
+    "tank": ("cryogenic_tank", ()),
+    "turbine, engineering": ("wind_turbine", ("--task", "engineering")),
+    "turbine, pitch": ("wind_turbine", planned(*SCHEDULED, "--unknown", "pitch", episodes=3, unseen=50)),
+    "turbine, inflow": ("wind_turbine", planned(*SCHEDULED, "--unknown", "inflow", episodes=3, unseen=50)),
+    "tank, bias_15": ("cryogenic_tank", planned(*VALVE, "--unknown", "bias_15", episodes=3, unseen=50)),
+    "hop, plane_6.3": ("flapping_wing", planned(*HOP, "--unknown", "plane_6.3", episodes=10, unseen=192)),
 }
+"""Recipe and options of each row of the table."""
 
 
 def train(recipe: str, options: Sequence[str], seed: int, folder: Path) -> Path:

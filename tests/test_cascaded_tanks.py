@@ -103,12 +103,12 @@ def test_the_recipe_identifies_a_synthetic_record(tmp_path, capsys):
 def test_the_record_is_read_from_a_file_or_the_package(tmp_path, monkeypatch):
     columns = synthetic(tmp_path / "data.csv", samples=30)
     read = read_benchmark(tmp_path / "data.csv")
-    for part, name in zip(read, ("uEst", "yEst", "uVal", "yVal"), strict=True):
+    for part, name in zip((*read["estimation"], *read["test"]), ("uEst", "yEst", "uVal", "yVal"), strict=True):
         np.testing.assert_allclose(part, columns[name], atol=1e-6)
     package = pytest.importorskip("nonlinear_benchmarks")
     parts = [SimpleNamespace(u=columns[f"u{name}"], y=columns[f"y{name}"]) for name in ("Est", "Val")]
     monkeypatch.setattr(package, "Cascaded_Tanks", lambda: parts)
-    np.testing.assert_array_equal(read_benchmark(None).test_level, columns["yVal"])
+    np.testing.assert_array_equal(read_benchmark(None)["test"][1], columns["yVal"])
 
 
 def test_every_part_of_a_record_is_held_out_once():
