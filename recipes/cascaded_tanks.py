@@ -19,7 +19,6 @@ from rt_torchrl.atomic_file import make_folder, write_json
 from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
-from rt_torchrl.fit.likelihood import Likelihood
 from rt_torchrl.options import AtLeastOne, NotNegative
 
 if TYPE_CHECKING:
@@ -86,9 +85,7 @@ def simulated(
     """The readings along a record by an identified twin, from a start that the first samples tell."""
     readings, noise = record.readings.clone(), estimate.likelihood.noise
     readings[first:] = torch.nan
-    start = estimation.fit_initial_states([record._replace(readings=readings)], noise)
-    likelihood = Likelihood(estimation.twin, [record], estimation.sensors, start.initial, noise, biases=start.biases)
-    return likelihood.simulated()[0]
+    return estimation.fit_initial_states([record._replace(readings=readings)], noise).simulated()[0]
 
 
 def folds_of(record: rt.SensorRecord, count: int) -> Iterator[tuple[list[rt.SensorRecord], rt.SensorRecord]]:

@@ -12,12 +12,12 @@ if __name__ == "__main__":
 
 import torch
 import tyro
+from pydantic import Field
 
 from rt_torchrl.atomic_file import finite, make_folder, new_folder, write_json
 from rt_torchrl.fit import resampling
-from rt_torchrl.fit.least_squares import Identified, identify
+from rt_torchrl.fit.least_squares import Identified, autocorrelation, identify
 from rt_torchrl.fit.log import Column, checked, pandas
-from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.options import Count, Positive
 from rt_torchrl.runs.command_line import plant_class
 from rt_torchrl.runs.run_folder import save_tensors
@@ -59,8 +59,8 @@ class Config:
     guess: tuple[str, ...] = ()
     dt: Positive | None = None
     gap: Positive | None = None
-    shortest: int = 10
-    held_out: float = 0.25
+    shortest: Annotated[int, Field(ge=2)] = 10
+    held_out: Annotated[float, Field(gt=0, lt=1)] = 0.25
     seed: Count = 0
     log_dir: Path | None = None
     estimation: rt.EstimationConfig = field(default_factory=lambda: rt.EstimationConfig(errors="robust"))
@@ -122,7 +122,7 @@ def main(config: Config) -> None:
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    sensors = with_biases(resampling.sensors_in(plant, log, config.sensors), config.biased)
+    sensors = resampling.sensors_in(plant, log, config.sensors, config.biased)
     spread = resampling.initial_spread(plant, log)
     task = rt.Estimation(rt.DigitalTwin(plant, closure), sensors, spread=spread, config=config.estimation)
     records = [[resampling.logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
@@ -148,10 +148,9 @@ def metrics_of(identified: Identified) -> dict[str, Any]:
     names, units = [sensor.name for sensor in sensors], [sensor.measurement.unit for sensor in sensors]
     summary: dict[str, Any] = {"iterations": estimate.iterations, "segment": estimate.segment}
     for side in ("training", "held_out"):
-        before, after = (judged.rms.tolist() for judged in getattr(identified, side))
-        rows = zip(names, units, before, after, strict=True)
-        summary[side] = {"rms": {name: {"unit": unit, "before": b, "after": a} for name, unit, b, a in rows}}
-    summary["autocorrelation"] = dict(zip(names, identified.autocorrelation.tolist(), strict=True))
+        rows = zip(names, units, getattr(identified, side).rms.tolist(), strict=True)
+        summary[side] = {"rms": {name: {"unit": unit, "error": error} for name, unit, error in rows}}
+    summary["autocorrelation"] = dict(zip(names, autocorrelation(estimate.likelihood).tolist(), strict=True))
     summary["noise"], summary["bias"] = estimate.noise, estimate.biases
     errors, intervals = uncertainty.standard_errors(), uncertainty.intervals()
     summary["weights"] = {
@@ -184,7 +183,7 @@ def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) 
 def table(metrics: dict[str, Any]) -> str:
     """The results, for the terminal."""
     of_sensors = {
-        f"{name} [{rms['unit']}], {side.replace('_', ' ')}": {"RMS error before": rms["before"], "after": rms["after"]}
+        f"{name} [{rms['unit']}], {side.replace('_', ' ')}": {"RMS error": rms["error"]}
         for side in ("training", "held_out")
         for name, rms in metrics[side]["rms"].items()
     }

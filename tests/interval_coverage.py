@@ -99,16 +99,11 @@ def recorded(
     closure: nn.Module,
     sensors: Sequence[rt.Sensor],
     generator: torch.Generator,
-    *,
-    share: float = 0.01,
     flights: Flights | None = None,
 ) -> Simulated:
-    """Noisy records of an episode under random commands, or of other flights; nothing is said of their first states.
-
-    ``share`` is the standard deviation of the noise over the RMS deviation of a sensor's readings from their mean.
-    """
-    flown = (flights or random_flights)(plant, closure, generator)
-    return with_noise([rt.sensor_record(plant, sensors, one) for one in flown], share, generator), None
+    """Noisy records of an episode under random commands, or of other flights; nothing is said of their first states."""
+    flown = flights(plant, closure, generator) if flights else [random_flight(plant, closure, generator)]
+    return with_noise([rt.sensor_record(plant, sensors, one) for one in flown], generator), None
 
 
 class Logging(NamedTuple):
@@ -130,7 +125,7 @@ def logged(
 ) -> Simulated:
     """The records that ``identify.py`` makes of the log of an episode, and the spread of their first states."""
     flown = random_flight(plant, closure, generator)
-    (record,) = with_noise([rt.sensor_record(plant, sensors, flown)], 0.01, generator)
+    (record,) = with_noise([rt.sensor_record(plant, sensors, flown)], generator)
     rows = slice(0, None, logging.every)
     held = [torch.cat([values, values[-1:]])[rows] for values in (flown.actions, flown.exogenous)]
     readings = record.readings[rows].clone()
@@ -148,10 +143,10 @@ def logged(
     return records, initial_spread(plant, log)
 
 
-def with_noise(records: Sequence[rt.SensorRecord], share: float, generator: torch.Generator) -> list[rt.SensorRecord]:
-    """Records with white noise, whose guesses of the first states stay the true ones; see :func:`recorded`."""
+def with_noise(records: Sequence[rt.SensorRecord], generator: torch.Generator) -> list[rt.SensorRecord]:
+    """Records with white noise of 1 % of the readings' RMS deviation from their mean; guesses stay the true ones."""
     readings = torch.cat([record.readings for record in records])
-    scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
+    scale = 0.01 * (readings - readings.mean(0)).square().mean(0).sqrt()
     found = []
     for record in records:
         noise = torch.randn(record.readings.shape, generator=generator, dtype=torch.float64)
@@ -176,11 +171,6 @@ def random_flight(
     drawn = torch.rand(1, -(-plant.n_steps // HELD), len(least), generator=generator, dtype=torch.float64)
     share = low + (high - low) * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
     return rt.Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]
-
-
-def random_flights(plant: rt.Plant, closure: nn.Module, generator: torch.Generator) -> list[rt.Trajectory]:
-    """One episode under random commands."""
-    return [random_flight(plant, closure, generator)]
 
 
 class Case(NamedTuple):

@@ -17,7 +17,7 @@ from rt_torchrl.export.c_file import c_array
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.steps.config import HypothesesConfig
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, extended
+from rt_torchrl.steps.hypotheses.ensemble import ALONE
 
 LAG = 0.35
 
@@ -106,7 +106,7 @@ def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, mon
 def test_unread_states_are_started_in_c(tmp_path):
     """An actuator at rest stands at zero; a sensor's bias shows from the first interval on."""
     plant = BiasedSensor(LaggedActuator(LinearQuadratic(), "force", LAG), "position", 0.5, scale=1.0)
-    closure = extended(plant, LinearClosure([[0.05, 0.0], [-0.4, 0.2]]))
+    closure = plant.extended(LinearClosure([[0.05, 0.0], [-0.4, 0.2]]))
     assert export_twin(closure, tmp_path / "it.c", plant, name="it") < 1e-9
     assert "void it_rest(const double *read, double *state);" in (tmp_path / "it.h").read_text()
     states = c_array([0.7, -0.4, 9.0, 9.0])

@@ -6,9 +6,8 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import drawn
-from tensordict import TensorDict
 
-from rt_torchrl import DigitalTwin, ExtendedClosure, PlantEnv, ReinforcementTwinning, TwinningConfig
+from rt_torchrl import DigitalTwin, ExtendedClosure
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
@@ -16,14 +15,13 @@ from rt_torchrl.runs.results import twin_entries
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (
+    LEAST,
     EnsembleAssimilation,
     Fit,
     Reread,
-    counting,
     evidence,
     misfit,
     reread,
-    with_hidden_states,
 )
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -85,19 +83,12 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
 def test_hidden_states_follow_from_what_was_read():
     real = LaggedActuator(PLANT, "force", LAG)
     record, states = recorded(real)
-    found = with_hidden_states(DigitalTwin(real, real.closure), record)
-    torch.testing.assert_close(found.states, states, rtol=1e-12, atol=1e-12)
-    assert with_hidden_states(DigitalTwin(PLANT, PLANT.closure), record) is record
-
-
-def test_hidden_states_that_diverge_are_refused_and_cost_a_hypothesis_its_weight():
-    real = LaggedActuator(PLANT, "force", LAG)
-    record, _ = recorded(real)
-    broken = DigitalTwin(real, real.closure)
+    twin = DigitalTwin(real, real.closure)
+    torch.testing.assert_close(twin.followed(record), states, rtol=1e-12, atol=1e-12)
     wild = record._replace(exogenous=record.exogenous + 1e308, actions=record.actions * 1e308)
     with pytest.raises(DivergenceError, match="is not finite"):
-        with_hidden_states(broken, wild)
-    assert misfit(broken, [wild], 5) == float("inf") > misfit(broken, [record], 5)
+        twin.followed(wild)
+    assert misfit(twin, [wild], 5) == float("inf") > misfit(twin, [record], 5)  # which costs a hypothesis its weight
 
 
 def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_states():
@@ -107,13 +98,12 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
     twin = DigitalTwin(real, ExtendedClosure(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), real.closure.own))
     reading, again = twin.of(Reread(real)), reread(record, real, 20)
     flown = reading.replay(again.states[None, 0], again.exogenous[None], again.actions[None]).states[0]
-    hidden = with_hidden_states(twin, record)
     for first in range(0, 100, 20):
         start = torch.cat([record.states[first], flown[first, 2:]])[None]
         part = twin.replay(start, record.exogenous[None, first : first + 20], record.actions[None, first : first + 20])
         torch.testing.assert_close(flown[first + 1 : first + 21], part.states[0, 1:], rtol=1e-12, atol=1e-12)
     # A lag of the actuator does not depend on what is read.
-    torch.testing.assert_close(flown[:, 2], hidden.states[:, 2], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(flown[:, 2], twin.followed(record)[:, 2], rtol=1e-12, atol=1e-12)
 
 
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
@@ -181,7 +171,7 @@ def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
 
 
 def kept(misfits):
-    return set(counting(evidence(misfits)))
+    return {name for name, share in evidence(misfits).items() if share >= LEAST}
 
 
 def test_weights_ask_for_evidence():
@@ -234,26 +224,6 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
     assert fitted_in == (list(range(14)) if always else [0, 2, 5, 10, 13])
 
 
-def test_a_twin_that_diverges_leaves_the_hypotheses_out():
-    """The step diverges for as long as a hypothesis counts."""
-    twin, _ = ensemble(PLANT)
-    policies = {role: LinearGain([[1.0, 1.0]]) for role in ("model_free", "model_based")}
-    config, generator = TwinningConfig(assimilation=ASSIMILATION), torch.Generator()
-    found = ReinforcementTwinning(PlantEnv(PLANT, seed=0), twin, **policies, config=config, generator=generator)
-    found.twin.weights = {"late": 1.0}
-    seen = []
-
-    def step(episode):
-        seen.append(found.twin.weights)
-        if "late" in found.twin.weights:
-            raise DivergenceError("late diverges")
-        return episode
-
-    report = found._sound(step, TensorDict())
-    assert seen == [{"late": 1.0}, {ALONE: 1.0}] and report["closure_refused"] == 1.0
-    assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
-
-
 def test_the_state_is_kept():
     """What goes on from it makes the same of the next record, in as many rounds."""
     twin, assimilation = ensemble(PLANT, call=0.05)
@@ -264,13 +234,12 @@ def test_the_state_is_kept():
     other.load_hypotheses(twin.state_dict()["hypotheses"])
     other.closure.load_state_dict(twin.closure.state_dict())
     resumed.load_state_dict(assimilation.state_dict())
-    assert resumed.called and counters(resumed) == counters(assimilation)
     # The hopeless one waits; the other one is fitted, and in fewer rounds than the first time.
-    assert counters(resumed)["late"][1:] == (1, 2) and counters(resumed)["lags"][0] < 1e-6
+    assert resumed.called and resumed.turns["late"].waiting == 1 and resumed.fits["lags"].least < 1e-6
     for one in (assimilation, resumed):
         one.update([record], (), 1, torch.Generator())
     assert other.weights == twin.weights == {"lags": 1.0} and resumed.misfits == assimilation.misfits
-    assert counters(resumed) == counters(assimilation) and counters(resumed)["late"][1:] == (0, 2)
+    assert resumed.turns == assimilation.turns and resumed.turns["late"].waiting == 0
     for share in range(1, 100):  # of several weights too, to the bit
         twin.weights = {"lags": 1.0, "late": share / 100.0}
         resumed.load_state_dict(assimilation.state_dict())
@@ -278,11 +247,6 @@ def test_the_state_is_kept():
     for name, one in twin.twins.items():
         for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
             assert torch.equal(mine, its)
-
-
-def counters(assimilation):
-    turns = assimilation.turns
-    return {name: (fit.least, turns[name].waiting, turns[name].pause) for name, fit in assimilation.fits.items()}
 
 
 def test_hypotheses_are_chosen_by_name():

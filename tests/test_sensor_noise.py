@@ -6,7 +6,6 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
 from rt_torchrl import ClassicalController, DigitalTwin, ExogenousConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.plants.sensors import NoisySensors
@@ -93,16 +92,6 @@ def test_what_the_twin_lacks_is_no_noise(missing):
     assert noise_levels(DigitalTwin(plant, wrong), [record]).tolist() == [0.0, 0.0]
 
 
-def test_increments_tell_the_noise_of_the_turbines_rotor_speed():
-    plant = WindTurbine(horizon=120.0)
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    levels = torch.tensor([0.01, *(len(plant.states) - 1) * [0.0]], dtype=torch.float64)
-    records = [episode(plant, policy, levels, seed=seed)[0] for seed in range(3)]
-    found = noise_levels(DigitalTwin(plant, plant.closure), records)
-    assert found[0].item() == pytest.approx(0.01, rel=0.15)
-    assert not found[-2:].any()  # the torque and the pitch, which the controller holds
-
-
 def believed(records, *, closure=None, level=LEVELS, known=True):
     """The belief of a twin that has flown some episodes, the costs of the readings and the noise of the sensors."""
     plant, policy = LinearQuadratic(horizon=20.0, noise=0.1), LinearGain([[0.8, 0.6]])
@@ -187,17 +176,7 @@ def test_unseen_episodes_on_the_twin_meet_the_noise_of_the_sensors():
     torch.testing.assert_close(unseen.fly(law).states, noisy.states)
     costs = unseen.control_costs(policy)
     assert torch.equal(costs, unseen.control_costs(policy))
-    # The closed loop step by step, with other noise.
-    generator, state, total = torch.Generator().manual_seed(7), unseen.initial_state, torch.zeros(200).double()
-    with torch.no_grad():
-        for k in range(plant.n_steps):
-            t, z = torch.tensor(k * plant.dt, dtype=torch.float64), unseen.exogenous[:, k]
-            read = state + LEVELS * torch.randn(200, 2, generator=generator, dtype=torch.float64)
-            end, applied = plant.step(t, state, policy(plant.observe(t, read, z)), z, plant.closure)
-            total += plant.running_cost(t, read, applied, z)
-            state = end
-    shares = [(values - quiet).mean().item() for values in (costs, total / plant.n_steps)]
-    assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[0] > 0.01
+    assert (costs - quiet).mean() > 0.01
     jumps = noisy.states[:, 1:] - noisy.states[:, :-1]
     assert jumps[..., 1].std() > LEVELS[1]  # of readings, and not of states
     assert unseen.judge(noisy).control_costs.tolist() == pytest.approx(costs.tolist())

@@ -27,7 +27,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:  # who draws unseen episodes of a plant needs no TorchRL
     from tensordict import TensorDictBase
-    from tensordict.nn import TensorDictModule
 
     from rt_torchrl.plants.signal import StateBounds
     from rt_torchrl.systems.real_system import RealSystem
@@ -182,8 +181,7 @@ class UnseenEpisodes:
             except DivergenceError:
                 if len(batch.states) == 1:
                     return batch.states.new_full((1,), torch.inf)
-                rows = torch.arange(len(batch.states), device=batch.states.device).split(1)
-                return torch.cat([costs(batch.rows(row)) for row in rows])
+                return torch.cat([costs(batch_of([alone])) for alone in batch.each()])
             return identification_cost(physics, replayed, batch.states)
 
         def means(flown: Trajectory) -> Costs:
@@ -239,22 +237,18 @@ class TwinEpisodes(UnseenEpisodes):
         return Trajectory(readings, flown.actions, self.exogenous)
 
     def _controlled(
-        self, twin: DigitalTwin, policy: nn.Module, starts: Tensor, inputs: Float[Tensor, "k n n_z"]
+        self, twin: DigitalTwin, policy: nn.Module, start: Tensor, inputs: Float[Tensor, "k n n_z"]
     ) -> Trajectory:
         """Episodes on a twin, of which those that diverge are NaN."""
-
-        def flown(start: Tensor, exogenous: Tensor) -> Trajectory:
-            try:
-                return twin.control(policy, start, exogenous)
-            except DivergenceError:
-                if len(start) > 1:
-                    alone = (flown(start[k : k + 1], exogenous[k : k + 1]).each()[0] for k in range(len(start)))
-                    return batch_of(list(alone))
-                nan = start.new_full((1, exogenous.shape[1], start.shape[-1] + len(self.plant.actions)), torch.nan)
-                lost, actions = nan.split([start.shape[-1], len(self.plant.actions)], -1)
-                return Trajectory(torch.cat([start[:, None], lost], 1), actions, exogenous)
-
-        return flown(starts, inputs)
+        try:
+            return twin.control(policy, start, inputs)
+        except DivergenceError:
+            if len(start) > 1:
+                alone = zip(start.split(1), inputs.split(1), strict=True)
+                return batch_of([self._controlled(twin, policy, *episode).each()[0] for episode in alone])
+            states = start.new_full((1, inputs.shape[1] + 1, start.shape[-1]), torch.nan)
+            states[:, 0] = start
+            return Trajectory(states, states.new_full((1, inputs.shape[1], len(self.plant.actions)), torch.nan), inputs)
 
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
         """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""
@@ -300,27 +294,26 @@ class RealEpisodes(UnseenEpisodes):
         return batch_of([self._to_the_horizon(episode) for episode in flown])
 
     def _flight(self, policy: nn.Module) -> "TensorDictBase":
-        """An episode in which all readings are right."""
+        """An episode in which all readings are right; where the system fails, the error says in which interval."""
+        from tensordict.nn import TensorDictModule
+
+        from rt_torchrl.systems.collectors import fly
         from rt_torchrl.systems.sound_part import FLIGHTS, report_of, sound_part, tried_in_vain
 
-        refused = list[str]()
+        device, refused = self.initial_state.device, list[str]()
+        live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))
+        actor = TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
         while len(refused) < FLIGHTS:
-            episode = self._attempt(policy)
+            live.begin(policy, strength=0.0)
+            rows, why = fly(self._system, self._system.reset, lambda k, row: actor(row), self.plant)
+            if why is not None:
+                raise ValueError(why)
+            episode = torch.cat(rows)
             sound = sound_part(episode, self.plant, report_of(self._system))
             if sound.whole:
                 return episode
             refused.append(sound.reason)
         raise ValueError(tried_in_vain(refused))
-
-    def _attempt(self, policy: nn.Module) -> "TensorDictBase":
-        """One episode; where the system fails, the error says in which interval."""
-        from rt_torchrl.systems.collectors import fly
-
-        actor = self._actor(policy)
-        rows, why = fly(self._system, self._system.reset, lambda k, row: actor(row), self.plant)
-        if why is not None:
-            raise ValueError(why)
-        return torch.cat(rows)
 
     def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
         """The trajectory of an episode; one that ended early stays in the state in which it ended."""
@@ -331,15 +324,6 @@ class RealEpisodes(UnseenEpisodes):
             torch.cat([episode["next", "applied"], action.expand(rest, -1)]),
             continued(episode["exogenous"], self.plant.n_steps),
         )
-
-    def _actor(self, policy: nn.Module) -> "TensorDictModule":
-        """The policy at the beginning of an episode, within the ranges of the actions."""
-        from tensordict.nn import TensorDictModule
-
-        device = self.initial_state.device
-        live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))
-        live.begin(policy, strength=0.0)
-        return TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
 
 class Judged(NamedTuple):

@@ -15,12 +15,12 @@ def twin_and_sensors(identified: Identified) -> Figure:
     The notes give the root mean square errors on the held-out records.
     """
     sensors, dt = identified.estimate.likelihood.sensors, identified.estimate.likelihood.plant.dt
-    training, held_out = identified.training[1].records, identified.held_out[1].records
+    training, held_out = identified.training.records, identified.held_out.records
     begin, last = training[0].start, held_out[-1].start
     unit, length = style.time_unit(last + dt * len(held_out[-1].actions) - begin)
     size = (9.0, 1.2 + 2.2 * len(sensors))
     figure, axes = style.grid(len(sensors), title="Twin and sensors", size=size, xlabel=f"time [{unit}]")
-    parts = ((training, identified.training[1]), (held_out, identified.held_out[1]))
+    parts = ((training, identified.training), (held_out, identified.held_out))
     for k, (ax, sensor) in enumerate(zip(axes, sensors, strict=True)):
         readings = np.concatenate([array(record.readings[:, k]) for record in (*training, *held_out)])
         margin = 0.1 * (np.nanmax(readings) - np.nanmin(readings)) or 1.0
@@ -34,8 +34,8 @@ def twin_and_sensors(identified: Identified) -> Figure:
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
         # A twin that is far off must not flatten what was read.
         ax.set_ylim(np.nanmin(readings) - margin, np.nanmax(readings) + margin)
-        before, after = (style.with_unit(fit.rms[k].item(), sensor.measurement.unit) for fit in identified.held_out)
-        caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
+        error = style.with_unit(identified.held_out.rms[k].item(), sensor.measurement.unit)
+        caption(ax, sensor.measurement.label, f"RMS held out {error}")
     legend_below(figure, axes)
     return figure
 

@@ -11,6 +11,7 @@ Over a whole record of an unstable system the twin explodes whatever its weights
 are then cut into segments with first states of their own (multiple shooting), whose length the data choose.
 """
 
+import contextlib
 import copy
 import math
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import AtLeastOne, Count, NotNegative, configuration
 from rt_torchrl.plants.plant import Plant
@@ -60,50 +62,14 @@ MOST_UNKNOWNS = 1000
 
 
 class Minimum(NamedTuple):
-    """A likelihood at its minimum, its cost, the number of trial steps, and the length of its segments."""
+    """A likelihood at its minimum, the number of trial steps, and the length of its segments."""
 
     likelihood: Likelihood
-    best: float
     iterations: int
     segment: int = 0
 
 
 R = TypeVar("R")
-
-
-def multi_start(closure: nn.Module, starts: int, descend: Callable[[int], Minimum]) -> Minimum:
-    """Descend from several first weights; the best weights stay.
-
-    The first two descents begin with the present weights. The others begin with these and with the best ones so far in
-    turns, moved at random: the best may have run to where nothing shows them.
-
-    Args:
-        closure: closure with the weights.
-        starts: number of first weights.
-        descend: function of the number of the descent, which moves the weights and returns the result.
-
-    Returns:
-        The least minimum, with the trial steps of all descents that have not diverged.
-
-    Raises:
-        FloatingPointError: if the first descent diverges.
-    """
-    generator, origin = torch.Generator().manual_seed(0), copy.deepcopy(closure.state_dict())
-    least, best = descend(0), copy.deepcopy(closure.state_dict())
-    iterations = least.iterations
-    for number in range(1, 1 + starts):
-        closure.load_state_dict(best if number > 1 and number % 2 else origin)
-        if number > 1:
-            move(closure, generator)
-        try:
-            minimum = descend(number)
-        except FloatingPointError:  # weights drawn at random may be nonsense
-            continue
-        iterations += minimum.iterations
-        if minimum.best < least.best:
-            least, best = minimum, copy.deepcopy(closure.state_dict())
-    closure.load_state_dict(best)
-    return least._replace(iterations=iterations)
 
 
 def over_segments(
@@ -135,53 +101,48 @@ def over_segments(
     """
     start = copy.deepcopy(closure.state_dict())
     fits: dict[int, tuple[R, Tensor, dict[str, Tensor]]] = {}
-    diverged: list[FloatingPointError] = []
 
-    def explains(length: int, start: dict[str, Tensor]) -> bool:
-        closure.load_state_dict(start)
-        try:
+    def explains(length: int, weights: dict[str, Tensor]) -> bool:
+        closure.load_state_dict(weights)
+        with contextlib.suppress(FloatingPointError):
             result, errors = fit(length)
-        except FloatingPointError as failed:
-            diverged.append(failed)
-            return False
-        fits[length] = result, errors, copy.deepcopy(closure.state_dict())
-        return bool((errors <= enough).all())
+            fits[length] = result, errors, copy.deepcopy(closure.state_dict())
+            return bool((errors <= enough).all())
+        return False
 
-    short = max(intervals // SHORT, 2)
-    whole = explains(0, start)
+    def misfit(entry: tuple[R, Tensor, dict[str, Tensor]]) -> float:
+        return (entry[1] / enough).square().mean().item()
+
+    first, short, whole = start, max(intervals // SHORT, 2), explains(0, start)
     closure.load_state_dict(start)
     if short < intervals and (not whole or ((fits[0][1] > SURE * enough).any() and unstable())):
-        first = fits.pop(0, None)
+        before = fits.pop(0, None)
         while short < intervals and not fits:  # the shortest segments may have too many first states
             explains(short, start)
             short *= SHORTENED
-        probed = fits.popitem()[1] if fits else None
-        if probed is not None:
-            closure.load_state_dict(probed[2])  # whole records bend the weights until nothing grows
+        if fits:
+            _, (_, errors, weights) = fits.popitem()
+            closure.load_state_dict(weights)  # whole records bend the weights until nothing grows
             grows = unstable()
-            enough = torch.minimum(enough, DEPARTURE * probed[1]) if grows else enough
-            whole = explains(0, probed[2]) or (0 in fits and not grows)
-            if first is None or not first[1].isfinite().all():
-                start = probed[2]
-        if first is not None and (0 not in fits or _misfit(first[1], enough) <= _misfit(fits[0][1], enough)):
-            fits[0] = first
+            enough = torch.minimum(enough, DEPARTURE * errors) if grows else enough
+            whole = explains(0, weights) or (0 in fits and not grows)
+            if before is None or not before[1].isfinite().all():
+                first = weights
+        if before is not None and (0 not in fits or misfit(before) <= misfit(fits[0])):
+            fits[0] = before
     length = 0
     while not whole and length != 1:
         length = max((length or intervals) // SHORTENED, 1)
-        whole = explains(length, start)
+        whole = explains(length, first)
     if not fits:
-        raise diverged[0]
+        closure.load_state_dict(start)
+        return fit(0)[0]  # which says why it fails
     least = torch.stack([errors for _, errors, _ in fits.values()]).amin(0)
     follow = [entry for entry in fits.values() if (entry[1] <= DEPARTURE * least).all()]
     # The errors of no length are least for all sensors, if those of some grow where those of others fall.
-    result, _, weights = follow[0] if follow else min(fits.values(), key=lambda entry: _misfit(entry[1], enough))
+    result, _, weights = follow[0] if follow else min(fits.values(), key=misfit)
     closure.load_state_dict(weights)
     return result
-
-
-def _misfit(errors: Tensor, enough: Tensor) -> float:
-    """Mean square of RMS errors, in shares of what is small enough."""
-    return (errors / enough).square().mean().item()
 
 
 @torch.no_grad()
@@ -244,12 +205,12 @@ class Estimate(NamedTuple):
 
     def warnings(self) -> list[str]:
         """What a user must know before using the estimate, in plain words; empty if there is nothing."""
-        warnings, dt = [], self.likelihood.plant.dt
+        warnings = []
         if self.segment:
             warnings.append(
-                f"the twin was fitted over segments of {self.segment} control intervals ({self.segment * dt:g} s) with "
-                "first states of their own, as all errors here are; over whole records it may leave what was read, as "
-                "that of an unstable system does"
+                f"the twin was fitted over segments of {self.segment} control intervals "
+                f"({self.segment * self.likelihood.plant.dt:g} s) with first states of their own, as all errors here "
+                "are; over whole records it may leave what was read, as that of an unstable system does"
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
@@ -261,8 +222,6 @@ class Estimate(NamedTuple):
                 )
         if words := not_white(self.likelihood):
             warnings.append(words)
-        if self.before and all(self.after[name] == value for name, value in self.before.items()):
-            warnings.append("no weight has moved: no step lowers the cost of the fit. Try other first weights")
         return warnings + self.uncertainty.warnings()
 
 
@@ -327,25 +286,40 @@ class Estimation:
         )
 
     def _minimum(self, records: Sequence[SensorRecord], length: int) -> Minimum:
-        """Fit records, or segments of a length, from the present weights, with the noise levels that they leave."""
+        """Fit records, or segments of a length, from several first weights, with the noise levels that they leave.
+
+        The first two descents begin with the present weights. The others begin with these and with the best ones so far
+        in turns, moved at random: the best may have run to where nothing shows them.
+        """
         closure, config = self.twin.closure, self.config
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
-        prior = WeightPrior(closure, config.prior)
-
-        def descend(number: int) -> Minimum:
-            steps = self._descended(self.likelihood(records, prior=prior, known=True)).iterations if number else 0
-            minimum = self._descended(self.likelihood(records, prior=prior))
-            return minimum._replace(iterations=steps + minimum.iterations)
-
-        minimum = multi_start(closure, config.starts, descend)
-        iterations = minimum.iterations
+        prior = WeightPrior(closure, config.prior) if config.prior else None
+        generator, origin = torch.Generator().manual_seed(0), copy.deepcopy(closure.state_dict())
+        least, weights, iterations = math.inf, origin, 0
+        for number in range(1 + config.starts):
+            closure.load_state_dict(weights if number > 1 and number % 2 else origin)
+            if number > 1:
+                move(closure, generator)
+            try:
+                if number:
+                    iterations += self._descended(self.likelihood(records, prior=prior, known=True)).iterations
+                likelihood = self.likelihood(records, prior=prior)
+                descended = self._descended(likelihood)
+            except FloatingPointError:
+                if number:  # weights drawn at random may be nonsense
+                    continue
+                raise
+            iterations += descended.iterations
+            if not number or descended.best < least:
+                least, best, weights = descended.best, likelihood, copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(weights)
         for _ in range(config.rounds):
-            rest = self._follow_residuals(minimum.likelihood)
-            iterations += self._descended(minimum.likelihood).iterations
+            rest = self._follow_residuals(best)
+            iterations += self._descended(best).iterations
             if rest:
                 break
-        return minimum._replace(iterations=iterations, segment=length)
+        return Minimum(best, iterations, length)
 
     def _longest(self, records: Sequence[SensorRecord]) -> Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
@@ -379,8 +353,8 @@ class Estimation:
             likelihood = free.likelihood(parts, noise, weights=False, biases=torch.zeros_like(noise))
             size, ends = likelihood.initial.unit.sum(-1), dict[int, Tensor]()
             try:
-                for replay in likelihood.replays():
-                    ends.update(zip(replay.group.numbers, replay.sensitivity[:, -1] / size[:, None], strict=True))
+                for group, _, sensitivity in likelihood.replays():
+                    ends.update(zip(group.numbers, sensitivity[:, -1] / size[:, None], strict=True))
             except DivergenceError:
                 return True
             growth = torch.eye(len(size), dtype=size.dtype, device=size.device)
@@ -447,10 +421,9 @@ class Estimation:
         method.run(likelihood.normal_equations, INITIAL_ITERATIONS)
         return likelihood
 
-    def _descended(self, likelihood: Likelihood) -> Minimum:
+    def _descended(self, likelihood: Likelihood) -> Descended:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
-        descended = optimiser.run(likelihood.normal_equations, self.config.iterations)
-        return Minimum(likelihood, descended.best, descended.iterations)
+        return optimiser.run(likelihood.normal_equations, self.config.iterations)
 
     def _follow_residuals(self, likelihood: Likelihood) -> bool:
         """Set noise levels by the residuals; whether they rest."""
@@ -536,14 +509,12 @@ class Judgement(NamedTuple):
 class Identified(NamedTuple):
     """Result of an identification: the estimate, and how well the twin replays both kinds of records.
 
-    Where the estimate is over segments, so are the errors. ``autocorrelation`` holds the correlation of neighbouring
-    residuals of each sensor, near 0 for white noise.
+    Where the estimate is over segments, so are the errors.
     """
 
     estimate: Estimate
-    training: tuple[Judgement, Judgement]  # before and after
-    held_out: tuple[Judgement, Judgement]
-    autocorrelation: Float[Tensor, " n_y"]
+    training: Judgement
+    held_out: Judgement
 
 
 def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out: Sequence[SensorRecord]) -> Identified:
@@ -553,21 +524,13 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
         ValueError: if a sensor has no sample in the training records.
         DivergenceError: if the twin diverges under the weights that it starts from.
     """
-    closure, dt = estimation.twin.closure, estimation.twin.plant.dt
-    start = copy.deepcopy(closure.state_dict())
     estimate = estimation.run(training)
-    length, trained = estimate.segment, copy.deepcopy(closure.state_dict())
-    noise, biases = estimate.likelihood.noise, estimate.likelihood.biases().detach()
-    sides = [estimate.likelihood.records, list(held_out)]
-    if length:
-        sides[1] = [part for record in held_out for part in segments(record, length, dt)]
-    after = [judged(estimate.likelihood), judged(estimation.fit_initial_states(sides[1], noise, biases))]
-    closure.load_state_dict(start)
-    first = first_noise(estimation.sensors, training)
-    before = [judged(estimation.fit_initial_states(records, first)) for records in sides]
-    closure.load_state_dict(trained)
-    on_training, on_held_out = zip(before, after, strict=True)
-    return Identified(estimate, on_training, on_held_out, autocorrelation(estimate.likelihood))
+    if estimate.segment:
+        dt = estimation.twin.plant.dt
+        held_out = [part for record in held_out for part in segments(record, estimate.segment, dt)]
+    likelihood = estimate.likelihood
+    other = estimation.fit_initial_states(held_out, likelihood.noise, likelihood.biases().detach())
+    return Identified(estimate, judged(likelihood), judged(other))
 
 
 def judged(likelihood: Likelihood) -> Judgement:
@@ -586,7 +549,7 @@ def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
     """Correlation of the residuals of neighbouring samples that exist, for each sensor."""
     products, squares = torch.zeros_like(likelihood.noise), torch.zeros_like(likelihood.noise)
     for block in likelihood.residuals():
-        for values, seen in zip(block.values, block.seen, strict=True):
+        for values, seen in zip(block.values, block.group.seen, strict=True):
             for k in range(len(products)):
                 r = values[seen[:, k], k]
                 products[k] += r[1:] @ r[:-1]
@@ -597,9 +560,9 @@ def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
 def not_white(likelihood: Likelihood) -> str:
     """What residuals that are no noise say of the standard errors; empty where neighbours are hardly alike."""
     pairs = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), strict=True)
-    if not (alike := [f"{sensor.name} ({value:.2g})" for sensor, value in pairs if value > ALIKE]):
-        return ""
-    return (
-        f"neighbouring residuals of {', '.join(alike)} are alike: the twin lacks something, or steps or reads too "
-        "coarsely, and standard errors do not hold what that changes"
+    alike = ", ".join(f"{sensor.name} ({value:.2g})" for sensor, value in pairs if value > ALIKE)
+    words = (
+        f"neighbouring residuals of {alike} are alike: the twin lacks something, or steps or reads too coarsely, and "
+        "standard errors do not hold what that changes"
     )
+    return words if alike else ""

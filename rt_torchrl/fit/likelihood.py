@@ -11,7 +11,6 @@ Fisher information of the unknowns. With the sensors of :func:`rt_torchrl.fit.se
 the paper's J_p.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,21 +38,18 @@ class WeightPrior:
     Args:
         closure: closure with the weights.
         stiffness: factor Λ of all weights of perceptrons.
-        device: device for a closure without trained weights.
     """
 
-    def __init__(self, closure: nn.Module, stiffness: float, *, device: torch.device | str = "cpu"):
-        self.closure, self.stiffness, self._device = closure, stiffness, device
+    def __init__(self, closure: nn.Module, stiffness: float):
+        self.closure, self.stiffness = closure, stiffness
         self.start = self.weights().detach().clone()
         held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
         trained = [w for w in closure.parameters() if w.requires_grad]
-        masks = [torch.full_like(w.detach().flatten(), float(id(w) in held)) for w in trained]
-        self.held = torch.cat(masks) if masks else self.start
+        self.held = torch.cat([torch.full_like(w.detach().flatten(), float(id(w) in held)) for w in trained])
 
     def weights(self) -> Tensor:
         """The trained weights in one vector."""
-        trained = [w.flatten() for w in self.closure.parameters() if w.requires_grad]
-        return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64, device=self._device)
+        return torch.cat([w.flatten() for w in self.closure.parameters() if w.requires_grad])
 
     def cost(self) -> Tensor:
         """The cost, differentiable by the weights."""
@@ -98,24 +94,15 @@ class Group(NamedTuple):
     places: Int[Tensor, "batch n_local"]
 
 
-class Replays(NamedTuple):
-    """A group as the twin replays it, with the derivatives of the states by weights and offsets of initial states."""
-
-    group: Group
-    states: Float[Tensor, "batch samples n_s"]
-    sensitivity: Float[Tensor, "batch samples n_s n_p"]
-
-
 class Residuals(NamedTuple):
     """Residuals r of a group in units of the noise, with their derivatives; both are zero where a sample is missing.
 
-    ``jacobian`` holds derivatives by the unknowns of each record, whose places among all unknowns are ``places``.
+    ``jacobian`` holds derivatives by the unknowns of each record, whose places among all unknowns the group knows.
     """
 
-    seen: Bool[Tensor, "batch samples n_r"]
-    values: Float[Tensor, "batch samples n_r"]
-    jacobian: Float[Tensor, "batch samples n_r n_local"]
-    places: Int[Tensor, "batch n_local"]
+    group: Group
+    values: Float[Tensor, "batch samples n_y"]
+    jacobian: Float[Tensor, "batch samples n_y n_local"]
 
 
 class Likelihood:
@@ -127,8 +114,8 @@ class Likelihood:
         sensors: the sensors of all records.
         initial: initial states of the records; their offsets come next.
         noise: standard deviation σ of each sensor.
-        spread: standard deviation ρ of the initial states about their guess; infinite for none.
-        biases: offsets of the sensors, which come last; None for none.
+        spread: standard deviation ρ of the initial states about their guess; infinite where nothing is known.
+        biases: offsets of the sensors, which come last.
         prior: prior of the closure's weights; None for none.
         weights: whether the closure's weights are unknowns.
     """
@@ -141,15 +128,13 @@ class Likelihood:
         initial: Offsets,
         noise: Float[Tensor, " n_y"],
         *,
-        spread: Float[Tensor, " n_s"] | None = None,
-        biases: Offsets | None = None,
-        prior: WeightPrior | None = None,
-        weights: bool = True,
+        spread: Float[Tensor, " n_s"],
+        biases: Offsets,
+        prior: WeightPrior | None,
+        weights: bool,
     ):
         self.twin, self.records, self.sensors = twin, list(records), tuple(sensors)
-        self.initial, self.noise, self.prior = initial, noise, prior
-        self.spread = torch.full_like(initial.guess[0], math.inf) if spread is None else spread
-        self.biases = biases or Offsets(torch.zeros_like(noise), (), noise)
+        self.initial, self.noise, self.spread, self.biases, self.prior = initial, noise, spread, biases, prior
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._unknown_weights = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
@@ -203,15 +188,15 @@ class Likelihood:
         return stiffness, distance
 
     @torch.no_grad()
-    def replays(self) -> list[Replays]:
-        """Replay every record with the present unknowns.
+    def replays(self) -> list[tuple[Group, States, Float[Tensor, "batch samples n_s n_p"]]]:
+        """Groups as the twin replays them: states, and their derivatives by weights and offsets of initial states.
 
         Raises:
             DivergenceError: if a state is not finite.
         """
-        return [self._replay(group) for group in self._groups]
+        return [(group, *self._replay(group)) for group in self._groups]
 
-    def _replay(self, group: Group) -> Replays:
+    def _replay(self, group: Group) -> tuple[Tensor, Tensor]:
         first, start, closure = self.initial()[group.numbers], group.times[:, 0], self.twin.closure
         free = bool(self.initial.free)
         ends, S = self.twin.sensitivities(first, group.exogenous, group.actions, start=start, initial=free)
@@ -223,7 +208,7 @@ class Likelihood:
             unit = self.initial.unit.T
             S = torch.cat([S, by_state @ unit], -1)
             at_start = torch.cat([at_start, unit.expand(*at_start.shape[:3], -1)], -1)
-        return Replays(group, torch.cat([first.unsqueeze(1), ends], 1), torch.cat([at_start, S], 1))
+        return torch.cat([first.unsqueeze(1), ends], 1), torch.cat([at_start, S], 1)
 
     @torch.no_grad()
     def residuals(self) -> list[Residuals]:
@@ -232,10 +217,9 @@ class Likelihood:
         Raises:
             DivergenceError: if a state is not finite.
         """
-        return [self._residuals(replay) for replay in self.replays()]
+        return [self._residuals(*replay) for replay in self.replays()]
 
-    def _residuals(self, replay: Replays) -> Residuals:
-        group, states, S = replay
+    def _residuals(self, group: Group, states: Tensor, S: Tensor) -> Residuals:
         weights = group.seen / self.noise
         readings = self._read(group, states)
         values = differences([sensor.measurement for sensor in self.sensors], readings, group.readings)
@@ -247,7 +231,7 @@ class Likelihood:
             jacobian = S[:, :, self._states]
         by_bias = self.biases.unit.T.expand(*values.shape, -1)
         jacobian = torch.cat([jacobian, by_bias], -1) * weights.unsqueeze(-1)
-        return Residuals(group.seen, values, jacobian, group.places)
+        return Residuals(group, values, jacobian)
 
     def _read(self, group: Group, states: States) -> Float[Tensor, "batch samples n_y"]:
         """What the sensors read, bias included."""
@@ -278,7 +262,7 @@ class Likelihood:
         cost, gradient = like.new_zeros(()), like.new_zeros(self.count)
         matrix = like.new_zeros(self.count, self.count)
         for block in self.residuals() if residuals is None else residuals:
-            r, A, places = block.values.flatten(1), block.jacobian.flatten(1, 2), block.places
+            r, A, places = block.values.flatten(1), block.jacobian.flatten(1, 2), block.group.places
             if not self.initial.free:  # all records have the same unknowns
                 r, A, places = r.reshape(1, -1), A.reshape(1, -1, A.shape[-1]), places[:1]
             cost = cost + 0.5 * r.square().sum()

@@ -2,21 +2,22 @@
 
 import csv
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.fit.sensors import known_sensors
-from rt_torchrl.options import OTHER_UNITS, Positive, array_of, configuration
+from rt_torchrl.options import OTHER_UNITS, Positive, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
-NUMBER = r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|inf|nan)"
+NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 COLUMN = re.compile(
     rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
     re.DOTALL,
@@ -45,8 +46,7 @@ class LogConfig:
     gap: Positive | None = None
 
 
-@configuration
-class Column:
+class Column(NamedTuple):
     r"""A column of a file, the signal that it holds, and its unit: a name, or value = factor·number + offset.
 
     Args:
@@ -54,11 +54,8 @@ class Column:
         signal: name of the plant's signal, or ``time``.
         factor: factor from the column's numbers to the signal's unit.
         offset: value of the signal where the column holds zero, in the signal's unit.
-        unit: unit of the column's numbers, see :func:`converted`; None if they have the unit of the signal, or if
-            factor and offset convert them.
-
-    Raises:
-        ValueError: if the factor is zero, factor or offset is not finite, or there is a unit beside them.
+        unit: unit of the column's numbers, such as ``rpm``, ``kPa``, ``°F`` or ``%``: that of the signal, or one of
+            ``OTHER_UNITS`` for it; None if they have the unit of the signal, or if factor and offset convert them.
     """
 
     header: str
@@ -67,29 +64,26 @@ class Column:
     offset: float = 0.0
     unit: str | None = None
 
-    def __post_init__(self) -> None:
-        scaled = (self.factor, self.offset) != (1.0, 0.0)
-        if not self.factor or (scaled and self.unit is not None):
-            raise ValueError(
-                f"column {self.header!r} has unit={self.unit!r}, factor={self.factor} and offset={self.offset}; give "
-                "one or the other: a unit, or a finite factor that is not zero, and an offset."
-            )
-
     @classmethod
     def parse(cls, text: str) -> "Column":
         """The column that ``HEADER=SIGNAL``, ``HEADER=SIGNAL[UNIT]`` or ``HEADER=SIGNAL*FACTOR+OFFSET`` describes.
 
         Raises:
-            ValueError: if the text has another form.
+            ValueError: if the text has another form, or the factor is zero.
         """
         match = COLUMN.fullmatch(text.strip())
-        if match is None:
+        if match is None or not float(match["factor"] or 1.0):
             raise ValueError(
                 f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
                 "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
             )
-        header, signal, unit, factor, offset = match.group("header", "signal", "unit", "factor", "offset")
-        return cls(header=header, signal=signal, factor=float(factor or 1.0), offset=float(offset or 0.0), unit=unit)
+        return cls(
+            match["header"],
+            match["signal"],
+            float(match["factor"] or 1.0),
+            float(match["offset"] or 0.0),
+            match["unit"],
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +100,7 @@ class SensorLog:
             that no part of the log goes over a cut, however short the time.
 
     Raises:
-        ValueError: if the times are not finite and increasing, or a column has another length.
+        ValueError: if the times are not finite and increasing.
     """
 
     times: Rows
@@ -114,11 +108,7 @@ class SensorLog:
     cuts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        t = array_of("times", self.times)
-        if t.ndim != 1:
-            raise ValueError(f"times has shape {t.shape}; a log has one time in each row.")
-        if not isinstance(self.columns, Mapping):
-            raise ValueError(f"columns={self.columns!r} must map each signal to its values.")
+        t = self.times
         if len(t) < 2 or not np.isfinite(t).all():
             raise ValueError(
                 f"times of the log: {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at "
@@ -127,14 +117,11 @@ class SensorLog:
         wrong = np.flatnonzero(np.diff(t) <= 0.0)
         if wrong.size:
             k = wrong[0] + 1
-            kind = "the same time as the one before" if t[k] == t[k - 1] else "an earlier time than the one before"
             raise ValueError(
-                f"row {k} of the log (counted from 0) has {kind}: {t[k]:.12g} s after {t[k - 1]:.12g} s; {wrong.size} "
-                "such times in all. Sort the log and keep one row of each instant."
+                f"row {k} of the log (counted from 0) has the same or an earlier time than the one before: {t[k]:.12g} "
+                f"s after {t[k - 1]:.12g} s; {wrong.size} such times in all. Sort the log and keep one row of each "
+                "instant."
             )
-        for name, values in self.columns.items():
-            if array_of(f"column {name!r}", values).shape != t.shape:
-                raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
 
     def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
         """The log of some of its rows; rows that are left out become a gap."""
@@ -182,45 +169,38 @@ def logged_signals(plant: Plant) -> tuple[Signal, ...]:
 def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
     """Read the columns of a file that hold signals of a plant; other columns are ignored.
 
-    Blanks around a header do not count. Entries behind the last header are empty, as a delimiter at the end of a line
-    leaves them.
+    Blanks around a header do not count.
 
     Args:
-        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock, a
-            duration on that clock (``0:01:30``), or a date and time of day (ISO 8601), which is counted from the first
-            row. Either all dates have an offset from UTC or none has.
+        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock,
+            or a date and time of day (ISO 8601), which is counted from the first row. Either all dates have an offset
+            from UTC or none has.
         plant: plant whose signals the file holds.
         columns: columns whose header is not the name of their signal, or whose unit is not that of their signal.
 
     Raises:
-        ValueError: if the file cannot be read, a line has more or fewer entries than the header, a column is missing,
-            is there twice, names an unknown signal or is not numeric, the times are not increasing, or the unit of a
+        ValueError: if the file cannot be read, a line has more entries than the header, a column is missing, is there
+            twice, names an unknown signal or is not numeric, the times are not increasing, or the unit of a
             column is not known for its signal.
     """
     frame = _read(path)
     headers = list(frame)
     units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
-    for column in columns:
-        if column.header.strip() not in headers or column.signal not in units:
-            raise ValueError(
-                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(headers)}; "
-                f"plant {plant.name!r} has the signals {', '.join(units)}."
-            )
     declared = {column.signal: column for column in columns}
     if len(declared) < len(columns):
         raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; give each signal one column.")
-    chosen = {name: Column(header=name, signal=name) for name in units if name in headers} | declared
+    chosen = {name: Column(name, name) for name in units if name in headers} | declared
+    for column in chosen.values():
+        if headers.count(column.header.strip()) != 1 or column.signal not in units:
+            raise ValueError(
+                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(headers)}, of "
+                f"which one must have this header; plant {plant.name!r} has the signals {', '.join(units)}."
+            )
     if TIME not in chosen:
         raise ValueError(
             f"{path} has no column 'time'; it has {', '.join(headers)}. Say which it is, such as --columns t=time. In "
             "CSV files, commas part the columns."
         )
-    for column in chosen.values():
-        if (count := headers.count(column.header.strip())) > 1:
-            raise ValueError(
-                f"column {column.header!r} for {column.signal!r} is there {count} times in {path}, which has the "
-                f"columns {', '.join(headers)}; give each a header of its own."
-            )
     values = {name: _values(frame[column.header.strip()], column, units[name], path) for name, column in chosen.items()}
     return SensorLog(times=values.pop(TIME), columns=values)
 
@@ -278,27 +258,13 @@ def _read(path: Path) -> Any:
 
 
 def _read_csv(path: Path) -> Any:
-    """The table with the columns as the header says, after a look at every line: pandas would shift ragged ones.
-
-    Raises:
-        ValueError: if there is no header, or a line lacks entries or has some behind the last header.
-    """
+    """The table with the columns as the header says; pandas renames a header that is there twice."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = csv.reader(file)
-        rows = (row for row in lines if any(entry.strip() for entry in row) or len(row) > 1)  # no blank lines
-        headers = [header.strip() for header in next(rows, [])]
-        least = max((k for k, header in enumerate(headers, 1) if header), default=0)
-        if not least:
-            raise ValueError("it has no header")
-        for row in rows:
-            if len(row) < least or any(entry.strip() for entry in row[len(headers) :]):
-                raise ValueError(
-                    f"line {lines.line_num} has {len(row)} entries; the header has {len(headers)}: "
-                    f"{', '.join(headers)}. Mend the line or the header"
-                )
-    frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
-    # pandas gives a name to a column without one, and another name to a header that is there twice.
-    frame.columns = [header or name for header, name in zip(headers, frame, strict=True)]
+        headers = next((row for row in csv.reader(file) if row), [])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", pandas().errors.ParserWarning)  # of lines that are longer than the header
+        frame = pandas().read_csv(path, index_col=False)
+    frame.columns = [header.strip() or name for header, name in zip(headers, frame, strict=True)]
     return frame
 
 
@@ -314,76 +280,44 @@ READERS: dict[str, Callable[[Path], Any]] = {".csv": _read_csv, ".parquet": _rea
 
 def _values(series: Any, column: Column, unit: str, path: Path) -> Rows:
     """Numbers of a column in the signal's unit; a date becomes the seconds since the first date."""
-    if series.empty:
-        return np.empty(0)
-    pd, about = pandas(), f"column {column.header!r} of {path}"
-    dated = pd.api.types.is_datetime64_any_dtype(series) or pd.api.types.is_timedelta64_dtype(series)
-    numbers = series.map(lambda entry: np.nan) if dated else pd.to_numeric(series, errors="coerce")
-    blank = series.isna() | series.astype(str).str.strip().str.lower().isin(("", "nan"))
-    wrong = numbers.isna() & ~blank
+    pd, about, text = pandas(), f"column {column.header!r} of {path}", series.astype(str)
+    numbers = pd.to_numeric(series if pd.api.types.is_numeric_dtype(series) else text, errors="coerce")
+    present = series.notna() & ~text.str.strip().str.lower().isin(("", "nan"))
+    wrong = numbers.isna() & present
+    if column.signal == TIME and column.unit is None and wrong.any() and wrong[present].all():
+        return _seconds(text, present, about)
     if wrong.any():
-        if column.signal != TIME or not wrong[series.notna()].all():
-            what = (
-                f"dates; {column.signal} needs numbers."
-                if dated
-                else f"an entry that is {_entry(series, wrong, 'a number')}"
-            )
-            raise ValueError(f"{about} holds {what}")
-        if column.unit is not None:
-            raise ValueError(f"{about} holds dates; leave its unit {column.unit!r} away.")
-        numbers = _seconds(series, about)
-    values = column.factor * numbers.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
-    try:
-        return values if column.unit is None else converted(values, column.unit, unit)
-    except ValueError as error:
-        raise ValueError(f"{about} for signal {column.signal!r}: {error}") from error
+        raise ValueError(f"{about} holds an entry that is {_entry(text, wrong, 'a number')}")
+    known = {unit: (1.0, 0.0)} | {name: (size, zero) for name, size, zero in OTHER_UNITS.get(unit, ())}
+    if column.unit not in (None, *known):
+        raise ValueError(
+            f"{about} for signal {column.signal!r}: unit {column.unit!r} is none of {', '.join(known)}; convert from "
+            "others by HEADER=SIGNAL*FACTOR+OFFSET."
+        )
+    factor, offset = (column.factor, column.offset) if column.unit is None else known[column.unit]
+    values: Rows = factor * numbers.to_numpy(dtype=np.float64, na_value=np.nan) + offset
+    return values
 
 
-def _seconds(series: Any, about: str) -> Any:
-    """Durations in seconds, or the seconds of dates since the first one."""
-    pd = pandas()
-    text, present = series.astype(str), series.notna()
-    dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
-    # A number without a unit, such as 1,5, would be one of nanoseconds.
-    durations = pd.to_timedelta(text.where(text.str.contains("[:A-Za-z]")), errors="coerce")
-    as_dates = dates.notna().sum() >= durations.notna().sum()
+def _seconds(text: Any, present: Any, about: str) -> Rows:
+    """The seconds of dates since the first one."""
+    dates = pandas().to_datetime(text, utc=True, format="ISO8601", errors="coerce")
     offset = text.str.contains(WITH_OFFSET)
-    faults = {"a date (ISO 8601) or a duration (0:01:30)": (dates if as_dates else durations).isna()}
-    if as_dates:
-        faults["like the first one: with an offset from UTC, or without"] = offset != offset[present].iloc[0]
+    faults = {
+        "a date (ISO 8601)": dates.isna(),
+        "like the first one: with an offset from UTC, or without": offset != offset[present].iloc[0],
+    }
     for what, wrong in faults.items():
         if (wrong & present).any():
-            raise ValueError(f"{about} holds an entry that is {_entry(series, wrong & present, what)}")
-    if not as_dates:
-        return durations.dt.total_seconds()
-    return (dates - dates.dropna().iloc[0]).dt.total_seconds()
+            raise ValueError(f"{about} holds an entry that is {_entry(text, wrong & present, what)}")
+    seconds: Rows = (dates - dates.dropna().iloc[0]).dt.total_seconds().to_numpy()
+    return seconds
 
 
-def _entry(series: Any, wrong: Any, what: str) -> str:
+def _entry(text: Any, wrong: Any, what: str) -> str:
     """The first entry that is not what it should be, for a message."""
     k = int(np.argmax(wrong.to_numpy()))
-    return f"not {what}: {series.iloc[k]!r} in row {k} (counted from 0), {int(wrong.sum())} such rows."
-
-
-def converted(values: Rows, unit: str, to: str) -> Rows:
-    """The values in another unit.
-
-    Args:
-        values: numbers in ``unit``.
-        unit: unit of the values, such as ``rpm``, ``kPa``, ``°F`` or ``%``: that of the result, or one of
-            ``OTHER_UNITS`` for it.
-        to: unit of the result; ``-`` is the unit of a pure number.
-
-    Raises:
-        ValueError: if it is another unit.
-    """
-    known = {to: (1.0, 0.0)} | {name: (size, zero) for name, size, zero in OTHER_UNITS.get(to, ())}
-    if unit not in known:
-        raise ValueError(
-            f"unit {unit!r} is none of {', '.join(known)}; convert from others by HEADER=SIGNAL*FACTOR+OFFSET."
-        )
-    size, zero = known[unit]
-    return size * values + zero
+    return f"not {what}: {text.iloc[k]!r} in row {k} (counted from 0), {int(wrong.sum())} such rows."
 
 
 def pandas() -> Any:

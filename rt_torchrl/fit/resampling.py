@@ -59,16 +59,12 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
         shortest: number of control intervals below which a part is left out.
 
     Raises:
-        ValueError: if an argument is out of its range, no part is long enough, there are far more control intervals
-            than rows, or a state is missing that the plant cannot complete.
+        ValueError: if no part is long enough, there are far more control intervals than rows, or a state is missing
+            that the plant cannot complete.
     """
     intervals, left_out = np.diff(log.times), np.array(log.cuts, dtype=int) - 1
     sampled = np.delete(intervals, left_out)
     interval = float(np.median(sampled if len(sampled) else intervals))
-    if gap is not None and not gap > 0.0:
-        raise ValueError(f"gap={gap} s must be positive; it is the longest time between two rows that is bridged.")
-    if shortest < 2:
-        raise ValueError(f"shortest={shortest} control intervals must be at least 2.")
     limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
     cuts = np.union1d(np.flatnonzero(intervals > limit * (1.0 + ROUNDING)), left_out)
     ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
@@ -104,15 +100,13 @@ def hold_out(
     Args:
         segments: segments of the log, in order.
         dt: control interval [s].
-        share: share of all control intervals that is held out to judge by.
+        share: share of all control intervals that is held out to judge by, between 0 and 1.
         shortest: number of control intervals that a part of the divided segment needs; a segment with a shorter part
             stays whole.
 
     Raises:
-        ValueError: if the share is not between 0 and 1, or one side is left empty.
+        ValueError: if one side is left empty.
     """
-    if not 0.0 < share < 1.0:
-        raise ValueError(f"held_out={share} must lie between 0 and 1, a share of the log.")
     total = sum(len(segment.actions) for segment in segments)
     train_count = total - round(share * total)  # intervals to train on
     training, held_out, passed = [], [], 0
@@ -174,33 +168,35 @@ def _unwrapped(signal: Signal, values: Rows) -> Rows:
 
 def hidden_states(plant: Plant, log: SensorLog) -> list[str]:
     """States that a log does not hold, and that the plant cannot complete from those that it holds."""
+    logged = [state.name for state in logged_states(plant) if state.name in log.columns]
     lacking = [state.name for state in logged_states(plant) if state.name not in log.columns]
-    return [name for name in lacking if not _completes(plant, log, [other for other in lacking if other != name])]
-
-
-def _completes(plant: Plant, log: SensorLog, given: list[str]) -> bool:
-    """Whether the plant completes its states from those of the log and the given ones."""
-    names = [state.name for state in logged_states(plant) if state.name in log.columns]
     like = torch.zeros(2, dtype=torch.float64)
-    values = {name: like + float(np.nanmean(log.columns[name])) for name in names} | dict.fromkeys(given, like)
+    measured = {name: like + float(np.nanmean(log.columns[name])) for name in logged}
     inputs, actions = (
         torch.tensor([[float(np.nanmean(log.columns[signal.name])) for signal in signals]], dtype=torch.float64)
         for signals in (plant.acting_inputs, plant.actions)
     )
-    try:
-        plant.complete_states(values, plant.with_previews(inputs[None])[0], actions)
-    except ValueError:
-        return False
-    return True
+
+    def completes(name: str) -> bool:
+        others = {other: like for other in lacking if other != name}
+        try:
+            plant.complete_states(measured | others, plant.with_previews(inputs[None])[0], actions)
+        except ValueError:
+            return False
+        return True
+
+    return [name for name in lacking if not completes(name)]
 
 
-def sensors_in(plant: Plant, log: SensorLog, names: Sequence[str] = ()) -> tuple[Sensor, ...]:
-    """The sensors of a log, or those of the given names, with unknown noise.
+def sensors_in(
+    plant: Plant, log: SensorLog, names: Sequence[str] = (), biased: Sequence[str] = ()
+) -> tuple[Sensor, ...]:
+    """The sensors of a log, or those of the given names; see :func:`rt_torchrl.fit.sensors.sensors_of`.
 
     Raises:
-        ValueError: if a name is nothing that can be measured, the log has no such column, or it has no sensor at all.
+        ValueError: as :func:`~rt_torchrl.fit.sensors.sensors_of`, or if the log has no such column.
     """
-    sensors = sensors_of(plant, names or [name for name in known_sensors(plant) if name in log.columns])
+    sensors = sensors_of(plant, names or [name for name in known_sensors(plant) if name in log.columns], biased)
     absent = [sensor.name for sensor in sensors if sensor.name not in log.columns]
     if absent:
         raise ValueError(f"sensors={tuple(names)}: the log has no column {', '.join(absent)}; name it by --columns.")

@@ -65,19 +65,14 @@ def known_sensors(plant: Plant) -> dict[str, Sensor]:
     plant, its actions and inputs, is known and is no sensor.
     """
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
-    state_names = {signal.name for signal in plant.states}  # some are there only if they are asked for
-    measured = {
-        m.name: Sensor(measurement=m)
-        for m in plant.measurements
-        if m.name not in driven
-        and not isinstance(m.read, Preview)
-        and not (isinstance(m.read, Named) and m.read.name not in state_names)
-    }
     states = {
-        signal.name: Sensor(measurement=Measurement.of(signal)) for signal in plant.states if signal.name not in driven
-    }
-    overridden = {name for name in measured.keys() & states if measured[name].measurement.read != Named(name)}
-    return measured | {name: sensor for name, sensor in states.items() if name not in overridden}
+        signal.name: Measurement.of(signal) for signal in plant.states
+    }  # some are there only if they are asked for
+    known = {m.name: m for m in plant.measurements if not isinstance(m.read, Preview)}
+    # Some states are there only if they are asked for.
+    known = {k: m for k, m in known.items() if not isinstance(m.read, Named) or m.read.name in states}
+    known |= {k: m for k, m in states.items() if k not in known or known[k].read == Named(k)}
+    return {name: Sensor(measurement=m) for name, m in known.items() if name not in driven}
 
 
 def state_places(plant: Plant, sensors: Sequence[Sensor]) -> list[int | None]:
@@ -100,35 +95,27 @@ def state_sensors(plant: Plant) -> tuple[Sensor, ...]:
     )
 
 
-def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
+def sensors_of(plant: Plant, names: Sequence[str], biased: Sequence[str] = ()) -> tuple[Sensor, ...]:
     """The sensors of the named states and measurements of a plant, with unknown noise.
 
+    Args:
+        plant: the plant.
+        names: names of the sensors.
+        biased: names of those that have a constant bias that is estimated.
+
     Raises:
-        ValueError: if a name is no state and no measurement of the plant, or there is no name.
+        ValueError: if there is no name, a name is no state and no measurement of the plant, or a biased sensor is none
+            of the sensors.
     """
     known = known_sensors(plant)
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise ValueError(
-            f"sensors={tuple(names)} of plant {plant.name!r}: {', '.join(unknown) or 'nothing'} cannot be measured; "
-            f"choose among {', '.join(known)}."
-        )
-    return tuple(known[name] for name in names)
-
-
-def with_biases(sensors: Sequence[Sensor], names: Sequence[str]) -> tuple[Sensor, ...]:
-    """The sensors, of which the named ones have a constant bias that is estimated.
-
-    Raises:
-        ValueError: if a name is none of the sensors.
-    """
-    known = [sensor.name for sensor in sensors]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(
-            f"biased={tuple(names)}: {', '.join(unknown)} is none of the sensors; choose among {', '.join(known)}."
-        )
-    return tuple(dataclasses.replace(sensor, bias=sensor.bias or sensor.name in names) for sensor in sensors)
+    for argument, chosen, among in (("sensors", names, known), ("biased", biased, names)):
+        unknown = [name for name in chosen if name not in among]
+        if unknown or not names:
+            raise ValueError(
+                f"{argument}={tuple(chosen)} of plant {plant.name!r}: {', '.join(unknown) or 'nothing'} cannot be "
+                f"measured; choose among {', '.join(among)}."
+            )
+    return tuple(dataclasses.replace(known[name], bias=name in biased) for name in names)
 
 
 def read(

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from rt_torchrl.fit.likelihood import Likelihood
 
@@ -51,25 +51,24 @@ class Uncertainty:
 
     Attributes:
         covariance: covariance of all unknowns in their order; zero in directions of which nothing is known.
-        null: these directions, in columns, each as long as the information of the single unknowns makes it.
         names: names of the closure's values.
         values: these values.
+        named_covariance: their covariance.
     """
 
     @torch.no_grad()
     def __init__(self, likelihood: Likelihood, *, errors: Errors = "fisher"):
-        self.likelihood, self.errors = likelihood, errors
+        self.likelihood = likelihood
         blocks = likelihood.residuals()
         equations = likelihood.normal_equations(blocks)
-        self.information = equations.matrix
-        self._inverse = inverse_information(self.information)
-        self.covariance, self.null = self._inverse.matrix, self._inverse.null
+        self._inverse = inverse_information(equations.matrix)
+        self.covariance = self._inverse.matrix
         ahead = -(self.covariance @ equations.gradient)[: likelihood.weight_count]  # the Newton step
         if errors == "robust":
-            M, samples = torch.zeros_like(self.information), 0
+            M, samples = torch.zeros_like(equations.matrix), 0
             for block in blocks:
                 all_scores = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
-                for scores, seen, places in zip(all_scores, block.seen.any(-1), block.places, strict=True):
+                for scores, seen, places in zip(all_scores, block.group.seen.any(-1), block.group.places, strict=True):
                     M[places[:, None], places] += newey_west(scores[seen])
                     samples += int(seen.sum())
             root = self._inverse.root
@@ -78,32 +77,15 @@ class Uncertainty:
             white = squares / max(int(likelihood.samples.sum()) - root.shape[1], 1)
             self.covariance = (root * ratios.clamp_min(white)) @ root.T
         closure = likelihood.twin.closure
-        self.names, self._slopes = named_slopes(closure)
-        self._ahead = self._slopes @ ahead
+        self.names, slopes = named_slopes(closure)
+        self._ahead, n = slopes @ ahead, likelihood.weight_count
+        self.named_covariance = slopes @ self.covariance[:n, :n] @ slopes.T
+        self._undetermined = self._inverse.unknown(pad(slopes, (0, len(self.covariance) - n)))
         self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
-
-    @property
-    def weights_covariance(self) -> Float[Tensor, "n_w n_w"]:
-        """Covariance of the closure's weights alone."""
-        n = self.likelihood.weight_count
-        return self.covariance[:n, :n]
-
-    @property
-    def named_covariance(self) -> Float[Tensor, "n_named n_named"]:
-        """Covariance of the closure's named values."""
-        return self._slopes @ self.weights_covariance @ self._slopes.T
-
-    def undetermined(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
-        """Whether quantities change in a direction of which the data say nothing.
-
-        Args:
-            slopes: derivatives of each quantity by the closure's weights.
-        """
-        return self._inverse.unknown(pad(slopes, (0, len(self.covariance) - slopes.shape[-1])))
 
     def unknown(self) -> list[str]:
         """Names of the values that take part in a direction of which the data say nothing."""
-        return [name for name, free in zip(self.names, self.undetermined(self._slopes).tolist(), strict=True) if free]
+        return [name for name, free in zip(self.names, self._undetermined.tolist(), strict=True) if free]
 
     def standard_errors(self) -> dict[str, float]:
         """Standard error of every named value; infinite for one of which the data say nothing, zero for a fixed one."""
@@ -113,7 +95,7 @@ class Uncertainty:
     def correlations(self) -> Float[Tensor, "n_named n_named"]:
         """Correlations of the named values; nan for one of which the data say nothing."""
         C = self.named_covariance
-        scale = torch.where(self.undetermined(self._slopes), math.nan, C.diagonal().sqrt())
+        scale = torch.where(self._undetermined, math.nan, C.diagonal().sqrt())
         return C / torch.outer(scale, scale)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
@@ -122,7 +104,9 @@ class Uncertainty:
         Raises:
             ValueError: if the level does not lie between 0 and 1.
         """
-        factor = normal_factor(level)
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level={level} of a confidence interval must lie between 0 and 1.")
+        factor = NormalDist().inv_cdf(0.5 + 0.5 * level)
         pairs = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
         return {name: (value - factor * error, value + factor * error) for (name, error), value in pairs}
 
@@ -141,47 +125,22 @@ class Uncertainty:
     def warnings(self) -> list[str]:
         """What the data cannot tell, in plain words; empty if they tell every value."""
         errors, nothing = self.standard_errors(), self.unknown()
-        warnings = self._undetermined(nothing)
+        warnings = []
+        if nothing:
+            warnings.append(
+                f"the data do not tell {', '.join(nothing)}: at most combinations of them are known. Measure more, or "
+                "fix some of them"
+            )
         for (name, error), value in zip(errors.items(), self.values.tolist(), strict=True):
             if not math.isinf(error) and error > BAD_SHARE * abs(value):
                 warnings.append(f"the data hardly tell {name}: {value:.3g} with a standard error of {error:.2g}")
         R = self.correlations()
-        for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():
-            if not {self.names[i], self.names[j]} & set(nothing):
-                kind = "ratio" if R[i, j] > 0.0 else "product"
-                warnings.append(
-                    f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kind}, better "
-                    f"than each of them (correlation {R[i, j].item():.4f})"
-                )
+        for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():  # nan for those that are not told
+            warnings.append(
+                f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their ratio or product, "
+                f"better than each of them (correlation {R[i, j].item():.4f})"
+            )
         return warnings
-
-    def _undetermined(self, names: list[str]) -> list[str]:
-        """What to say of values that take part in directions of which the data say nothing."""
-        if not names:
-            return []
-        # The rank must not depend on the units of values and weights.
-        slopes = self._slopes[[self.names.index(name) for name in names]]
-        free = slopes @ self.null[: self.likelihood.weight_count]
-        for dim in (1, 0):
-            free = normalize(free, dim=dim, eps=1e-300)
-        rank = int(torch.linalg.matrix_rank(free, rtol=1e-3))
-        if rank == len(names):
-            return [f"the data say nothing of {name}; it keeps its first value" for name in names]
-        return [
-            f"the data cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {rank} combination(s) of them are "
-            f"free. Measure more, or fix {rank} of them"
-        ]
-
-
-def normal_factor(level: float) -> float:
-    """Half width of the interval that holds a normal number with a probability, in standard deviations.
-
-    Raises:
-        ValueError: if the probability does not lie between 0 and 1.
-    """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level={level} of a confidence interval must lie between 0 and 1.")
-    return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
 class InverseInformation(NamedTuple):

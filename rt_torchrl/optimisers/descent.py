@@ -126,7 +126,7 @@ class Descent:
         Raises:
             FloatingPointError: if the cost diverges at the weights that the descent starts from.
         """
-        trials = _Trials(self.module, cost, self.config, iterations, stop_below)
+        trials = _Trials(self, cost, iterations, stop_below)
         try:
             if self.config.optimiser == "lbfgs":
                 # Another episode has another cost: the curvature of the last one would mislead the line search.
@@ -159,14 +159,8 @@ class _Finished(Exception):
 class _Trials:
     """The function that an optimiser calls for cost and gradient; it remembers the best weights."""
 
-    def __init__(
-        self,
-        module: nn.Module,
-        cost: Callable[[], Tensor],
-        config: DescentConfig,
-        iterations: int,
-        stop_below: float,
-    ):
+    def __init__(self, descent: Descent, cost: Callable[[], Tensor], iterations: int, stop_below: float):
+        module, config = descent.module, descent.config
         self._module, self._cost = module, cost
         self._limit = config.gradient_limit if config.optimiser == "adam" else math.inf
         self._iterations, self._stop_below = iterations, stop_below
@@ -190,7 +184,22 @@ class _Trials:
             raise _Finished
         safe_point()
         try:
-            relative, cost, norm = self._differentiated()
+            with torch.enable_grad():
+                self._module.zero_grad(set_to_none=True)
+                cost = self._cost()
+                value = cost.item()
+                if self.count == 0:
+                    self.start = value
+                # A cost that starts at zero is no unit for later ones, which then keep their own.
+                relative = cost / (abs(self.start) or 1.0)
+                relative.backward()
+            weights = [w for w in self._module.parameters() if w.grad is not None]
+            norm = nn.utils.clip_grad_norm_(weights, self._limit).item()
+            if not (math.isfinite(value) and math.isfinite(norm)):
+                raise FloatingPointError(
+                    f"cost={value:g} of {type(self._module).__name__} with a relative gradient of norm {norm:g} is not "
+                    "finite; start the descent from weights whose cost and gradient are."
+                )
         except FloatingPointError:
             if self.count == 0:
                 raise
@@ -202,38 +211,14 @@ class _Trials:
             self.gradient = norm * (abs(self.start) or 1.0)
         self._sound = [w.detach().clone() for w in self._weights]
         self.count += 1
-        self._note(cost)
-        return relative
+        self._note(value)
+        return relative.item()
 
     @torch.no_grad()
     def halve_step(self) -> None:
         """Go half the way back to the last weights with a finite cost."""
         for weight, sound in zip(self._weights, self._sound, strict=True):
             weight.lerp_(sound, 0.5)
-
-    def _differentiated(self) -> tuple[float, float, float]:
-        """Relative cost, cost, and norm of the gradient; the gradient itself is left in the weights.
-
-        Raises:
-            FloatingPointError: if one of them is not finite.
-        """
-        with torch.enable_grad():
-            self._module.zero_grad(set_to_none=True)
-            cost = self._cost()
-            value = cost.item()
-            if self.count == 0:
-                self.start = value
-            # A cost that starts at zero is no unit for later ones, which then keep their own.
-            relative = cost / (abs(self.start) or 1.0)
-            relative.backward()
-        weights = [w for w in self._module.parameters() if w.grad is not None]
-        norm = nn.utils.clip_grad_norm_(weights, self._limit).item()
-        if not (math.isfinite(value) and math.isfinite(norm)):
-            raise FloatingPointError(
-                f"cost={value:g} of {type(self._module).__name__} with a relative gradient of norm {norm:g} is not "
-                "finite; start the descent from weights whose cost and gradient are."
-            )
-        return relative.item(), value, norm
 
     @torch.no_grad()
     def note_last(self) -> None:

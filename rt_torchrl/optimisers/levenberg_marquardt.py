@@ -95,10 +95,14 @@ class LevenbergMarquardt:
             scale = torch.maximum(scale, current.matrix.diagonal())
             step, damping = self._limited_step(current, scale)
             place(parameters_to_vector(weights) + step, weights)
-            trial = self._attempt(equations)
-            if trial is not None and trial.cost <= current.cost:
-                gain = (current.cost - trial.cost) / promised(current, step)
-                self.damping = max(self.damping * _relief(gain.clamp(0.0, 1.0).item()), self.least_damping)
+            try:
+                trial = equations()
+                lower = bool(trial.cost <= current.cost and trial.cost.isfinite() and trial.matrix.isfinite().all())
+            except FloatingPointError:  # the trajectory diverges there, which only refuses the step
+                lower = False
+            if lower:
+                share = ((current.cost - trial.cost) / promised(current, step)).clamp(0.0, 1.0).item()
+                self.damping = max(self.damping * max(0.1, 1.0 - (2.0 * share - 1.0) ** 3), self.least_damping)
                 current, growth = trial, 2.0
             else:
                 self.module.load_state_dict(before)
@@ -122,24 +126,11 @@ class LevenbergMarquardt:
             step = _step(current, damping, scale)
         return step * (self.longest_step / step.abs().max()).clamp(max=1.0), damping
 
-    def _attempt(self, equations: Callable[[], NormalEquations]) -> NormalEquations | None:
-        """The equations at the trial weights; None if the trajectory diverges there, which only refuses the step."""
-        try:
-            trial = equations()
-        except FloatingPointError:
-            return None
-        return trial if trial.cost.isfinite() and trial.matrix.isfinite().all() else None
-
 
 def _step(current: NormalEquations, damping: float, scale: Tensor) -> Tensor:
     # A weight that the record does not show gets the smallest curvature that exceeds rounding.
     floor = scale.max() * torch.finfo(scale.dtype).eps
     return -torch.linalg.solve(current.matrix + damping * torch.diag(scale.clamp_min(floor)), current.gradient)
-
-
-def _relief(gain: float) -> float:
-    """Factor of the damping after a step with this share of the decrease that it has promised."""
-    return max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
 
 
 def promised(equations: NormalEquations, step: Tensor) -> Tensor:

@@ -77,8 +77,7 @@ class Assimilation:
         of that, which is not yet known when this object is made.
         """
         self.first = copy.deepcopy(self.twin.closure.state_dict())
-        device = next((x.device for x in self.twin.plant.buffers()), "cpu")
-        self.prior = WeightPrior(self.twin.closure, self.config.prior, device=device)
+        self.prior = WeightPrior(self.twin.closure, self.config.prior)
 
     def update(
         self,
@@ -132,18 +131,10 @@ class Assimilation:
         return False
 
     def _fit(self, whole: Trajectory) -> Descended:
-        if self.config.segment is None:
-            return self._over_chosen_segments(whole)
-        self.length = min(self.config.segment, whole.actions.shape[1])
-        return self._descend_anew(self.in_segments(whole))
-
-    def in_segments(self, whole: Trajectory) -> Trajectory:
-        """Records as the last fit replayed them: in segments, of shorter records in shorter ones, or whole."""
-        length = min(self.length, whole.actions.shape[1])
-        return whole.segments(length, self.twin.plant.dt) if length else whole
-
-    def _over_chosen_segments(self, whole: Trajectory) -> Descended:
-        """Descend over whole records, or over segments if the twin is unstable and leaves these."""
+        """Descend over segments, or choose: whole records, or segments if the twin is unstable and leaves these."""
+        if self.config.segment is not None:
+            self.length = min(self.config.segment, whole.actions.shape[1])
+            return self._descend_anew(self.in_segments(whole))
         sensors, progress_before = self._problem.sensors, copy.deepcopy(self._progress())
         records, before = sensor_records(self.twin.plant, sensors, whole), dict[int, float]()
 
@@ -164,6 +155,11 @@ class Assimilation:
         )
         self._resume(progress)
         return descended
+
+    def in_segments(self, whole: Trajectory) -> Trajectory:
+        """Records as the last fit replayed them: in segments, of shorter records in shorter ones, or whole."""
+        length = min(self.length, whole.actions.shape[1])
+        return whole.segments(length, self.twin.plant.dt) if length else whole
 
     def _progress(self) -> dict[str, Any]:
         """What the next descent depends on, except the closure."""
@@ -215,11 +211,12 @@ class Assimilation:
         return descended
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
-        return identification_cost(self.twin.plant, self._flown(replayed), replayed.states, replayed.seen).mean()
+        flown = self._flown(replayed)
+        return identification_cost(self.twin.plant, flown, replayed.states, replayed.seen).mean()
 
     def _flown(self, replayed: Trajectory) -> Trajectory:
-        states, actions, exogenous, start, _ = replayed
-        return self.twin.replay(states[:, 0], exogenous, actions, start=start)
+        states, actions, exogenous, start, seen = replayed
+        return self.twin.replay(states[:, 0], exogenous, actions, start=start)._replace(seen=seen)
 
     @torch.no_grad()
     def cost_of(self, whole: Trajectory) -> float:
@@ -252,20 +249,16 @@ class Assimilation:
     @torch.no_grad()
     def _rms(self, replayed: Trajectory) -> Float[Tensor, " n_y"]:
         """RMS error of every state that J_p compares; infinite if the twin diverges."""
-        try:
+        sensors, errors = self._problem.sensors, replayed.states.new_full((len(self._problem.sensors),), math.inf)
+        with contextlib.suppress(FloatingPointError):
             if self.estimates:
                 return judged(self._problem.fit_initial_states(*self._compared(replayed))).rms
-            flown = self._flown(replayed)
-        except FloatingPointError:
-            return replayed.states.new_full((len(self._problem.sensors),), math.inf)
-        plant = self.twin.plant
-        places = [k for k, scale in enumerate(plant.discrepancy_scales) if scale < math.inf]
-        signals = [plant.states[k] for k in places]
-        errors = differences(signals, flown.states[..., places], replayed.states[..., places])
-        errors[:, 0] = math.nan  # no error is seen where a replay begins
-        if replayed.seen is not None:
-            errors = torch.where(replayed.seen.unsqueeze(-1), errors, math.nan)
-        return errors.flatten(0, 1).square().nanmean(0).sqrt()
+            parts = (sensor_records(self.twin.plant, sensors, states) for states in (self._flown(replayed), replayed))
+            flown, read = (torch.stack([record.readings for record in records]) for records in parts)
+            read[:, 0] = math.nan  # no error is seen where a replay begins
+            differing = differences([sensor.measurement for sensor in sensors], flown, read).flatten(0, 1)
+            errors = differing.square().nanmean(0).sqrt()
+        return errors
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.

@@ -125,18 +125,6 @@ def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
     return record._replace(states=plant.at_rest(record.states), exogenous=exogenous)
 
 
-def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
-    """The record with the hidden states of a twin's plant, which follow from the readings of every interval.
-
-    Raises:
-        DivergenceError: if the hidden states diverge.
-    """
-    n = record.states.shape[-1]
-    if n == len(twin.plant.states):
-        return record
-    return record._replace(states=torch.cat([record.states, twin.followed(record)[:, n:]], -1))
-
-
 class Fit:
     """The fit of one hypothesis over segments that begin with what was read (multiple shooting); the best weights stay.
 
@@ -243,8 +231,11 @@ class Fit:
 @torch.no_grad()
 def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
+    stacked = batch_of(records)
     try:
-        stacked = batch_of([with_hidden_states(twin, record) for record in records])
+        if twin.plant.unread:  # hidden states follow from the readings of every interval
+            hidden = torch.stack([twin.followed(record)[:, stacked.states.shape[-1] :] for record in records])
+            stacked = stacked._replace(states=torch.cat([stacked.states, hidden], -1))
         pieces = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
         flown = twin.replay(pieces.states[:, 0], pieces.exogenous, pieces.actions, start=pieces.start)
     except DivergenceError:
@@ -345,7 +336,7 @@ class EnsembleAssimilation(Assimilation):
         shares = evidence(self.misfits)
         for name, turns in self.turns.items():
             turns.rest(hopeless=shares[name] < HOPELESS)
-        self.ensemble.weights = counting(shares)
+        self.ensemble.weights = {name: share for name, share in shares.items() if share >= LEAST}
 
     def report(self) -> dict[str, float | str]:
         """The weight and the misfit of every hypothesis, and what is said of the twin where a hypothesis is believed.
@@ -388,11 +379,6 @@ class EnsembleAssimilation(Assimilation):
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
         self.called = state["called"]
         self.turns = {name: Turns(**saved) for name, saved in state["turns"].items()}
-
-
-def counting(shares: dict[str, float]) -> dict[str, float]:
-    """The weights of the hypotheses that are planned on."""
-    return {name: share for name, share in shares.items() if share >= LEAST}
 
 
 def evidence(misfits: dict[str, float]) -> dict[str, float]:

@@ -156,7 +156,8 @@ def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, eng
     Each hypothesis begins with a copy of the closure.
 
     Raises:
-        ValueError: if the plant suspects nothing of a name that the configuration lists.
+        ValueError: if the plant suspects nothing of a name that the configuration lists, or a suspect is no
+            :class:`Extension`, so that nobody knows what its closure is.
     """
     suspects = plant.suspects() if config.which == ("automatic",) else {}
     if config.which not in (("automatic",), ("none",)):
@@ -170,20 +171,11 @@ def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, eng
         suspects = {name: suspect for name, suspect in known.items() if name in config.which}
     if not suspects:
         return DigitalTwin(plant, closure, engine=engine)
-    device = next((w.device for w in closure.parameters()), torch.device("cpu"))
-    closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in suspects.items()}
+    device, closures = next((w.device for w in closure.parameters()), torch.device("cpu")), dict[str, nn.Module]()
+    for name, suspect in suspects.items():
+        if not isinstance(suspect, Extension):
+            raise ValueError(
+                f"hypothesis {name!r} of plant {plant.name!r} must be an Extension, or give a TwinEnsemble."
+            )
+        closures[name] = suspect.extended(copy.deepcopy(closure)).to(device)
     return TwinEnsemble(plant, closure, suspects, closures, engine=engine)
-
-
-def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
-    """A closure of the twin with the parameters of a suspect beside it.
-
-    Raises:
-        ValueError: if the suspect is no :class:`Extension`, so that nobody knows what its closure is.
-    """
-    if not isinstance(suspect, Extension):
-        raise ValueError(
-            f"suspect {type(suspect).__name__} of plant {suspect.name!r} is no Extension; give a TwinEnsemble with its "
-            "closure instead."
-        )
-    return suspect.extended(closure)
