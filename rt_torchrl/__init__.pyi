@@ -42,7 +42,7 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
-from .control.forecasts import Decaying, Forecast, Held
+from .control.forecasts import Decaying, Forecast
 from .control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 
 # Identification
@@ -122,7 +122,6 @@ __all__ = [
     "FMUError",
     "FirstController",
     "Forecast",
-    "Held",
     "HypothesesConfig",
     "LaggedActuator",
     "Learner",

@@ -29,8 +29,8 @@ PROGRAM = """
 #include "wing.h"
 #include <stdio.h>
 int main(void) {
-    const double e[FLY_OBSERVATIONS] = {%.17g, %.17g, %.17g, %.17g};
-    double a[FLY_ACTIONS];
+    const double e[4] = {%.17g, %.17g, %.17g, %.17g};
+    double a[2];
     fly(e, a);
     printf("%%.17g, %%.17g", a[0], a[1]);
     return 0;

@@ -10,7 +10,6 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import seeded
 
 from rt_torchrl import Rollout, SaturatedAffine, Signal, export_controller, export_twin, shipped_plants
-from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export import c_file
 from rt_torchrl.export.c_file import c_array
@@ -20,19 +19,16 @@ from rt_torchrl.programs.c_source import CSource
 CLOSE = 1e-9
 
 
-def state_type(n_actions, n_memory, n_last):
-    sizes = {"command": n_actions, "memory": n_memory, "last": n_last}
-    fields = [("steps", ctypes.c_ulonglong), *((name, ctypes.c_double * n) for name, n in sizes.items() if n)]
-    return type("State", (ctypes.Structure,), {"_fields_": fields})
-
-
 class InC:
     """A controller in C, compiled and called without this library's loader."""
 
     def __init__(self, path, n_actions, n_memory, n_signals):
         loaded = library(path)
         self.init, self.advance = (getattr(loaded, f"{path.stem}_{part}") for part in ("init", "step"))
-        self.state, self.action = state_type(n_actions, n_memory, n_signals)(), (ctypes.c_double * n_actions)()
+        sizes = {"command": n_actions, "memory": n_memory, "last": n_signals}
+        fields = [("steps", ctypes.c_ulonglong), *((name, ctypes.c_double * n) for name, n in sizes.items())]
+        self.state = type("State", (ctypes.Structure,), {"_fields_": fields})()
+        self.action = (ctypes.c_double * n_actions)()
 
     def start(self, *signals):
         self.init(ctypes.byref(self.state), c_array(signals))
@@ -155,11 +151,11 @@ def test_filters_clock_and_order_of_the_states(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", [*shipped_plants(), "gain-scheduled"])
-def test_controllers_of_the_plants(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", shipped_plants().values())
+def test_controllers_of_the_plants(kind, tmp_path, monkeypatch):
     monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 100)
-    plant = shipped_plants()[name]() if name in shipped_plants() else WindTurbine(observe=("scheduled",))
-    policy = plant.make_policy(seeded()) if name in shipped_plants() else GainScheduled(plant, generator=seeded())
+    plant = kind()
+    policy = plant.make_policy(seeded())
     assert export_controller(policy, tmp_path / "it.c", plant, name="it") < CLOSE
     InC(tmp_path / "it.c", len(plant.actions), len(plant.controller_states), 9)  # without a warning
 
@@ -175,27 +171,21 @@ class Guessed(Lagged):
         return torch.cat([rates[..., :1] + closure(state[..., 1:3])[..., 1:], rates[..., 1:]], -1)
 
 
-class Misnamed(LinearQuadratic):
-    controller_states = ("speed_error",)
-
-
 class Misstarted(Lagged):
     def controller_start(self, measured, exogenous):
         return measured[..., :1]
 
 
-REFUSED = {
-    "a state that depends on the closure": (Guessed, GAINS, r"integral, filtered_position\) depend on the closure"),
-    "a name that is no state": (Misnamed, [[1.0, 1.0]], "names speed_error; its states are position, velocity"),
-    "another number of first states": (Misstarted, GAINS, r"returns shape \(1, 1\); its last dimension must be 2"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_controller_is_refused(name, tmp_path):
-    kind, gains, message = REFUSED[name]
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (Guessed, r"integral, filtered_position\) depend on the closure"),
+        (Misstarted, r"returns shape \(1, 1\); its last dimension must be 2"),
+    ],
+)
+def test_what_is_no_controller_is_refused(kind, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        export_controller(LinearGain(gains), tmp_path / "it.c", kind(dt=0.1))
+        export_controller(LinearGain(GAINS), tmp_path / "it.c", kind(dt=0.1))
     assert not list(tmp_path.iterdir())
 
 

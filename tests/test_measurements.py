@@ -213,7 +213,7 @@ def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way()
     expected = 0.5 * ((4.0 / 2.0) ** 2 + (turned / 0.5) ** 2)
     assert Turning().discrepancy(one, other).tolist() == pytest.approx([expected], rel=1e-12)
     Turning.states = Turning.states[:1]
-    with pytest.raises(ValueError, match=r"state_sizes=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
+    with pytest.raises(ValueError, match=r"discrepancy_scales=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
         Turning().discrepancy(one[:, :1], other[:, :1])
 
 

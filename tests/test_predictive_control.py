@@ -17,7 +17,7 @@ from rt_torchrl.control.command_cost import PENALTY, CommandCost, descend
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.plants.signal import bounds
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.twin import constant
@@ -33,7 +33,6 @@ def control(plant=PLANT, closure=None, **options):
     ("dt", "horizon", "hold", "expected"),
     [
         (0.05, 10.0, None, 1.0),
-        (10.0, 1200.0, None, 200.0),
         (0.1, 2.0, None, 0.5),
         (0.1, 5.0, 0.5, 1.0),
         (1.0, 2.0, None, 1.0),
@@ -98,30 +97,6 @@ def test_model_predictive_control_that_nobody_set_suits_any_plant(plant):
     idle = torch.zeros(2, plant.n_steps, 1, dtype=torch.float64)
     costs = Rollout(plant, plant.closure).costs(unseen.initial_state, unseen.exogenous, idle)
     assert unseen.control_costs(controller).mean() < costs.mean()
-
-
-class Movable(LinearQuadratic):
-    """A plant that is to be held at a place, which its user may move."""
-
-    def __init__(self):
-        super().__init__(horizon=2.0, noise=0.0)
-        self.register_buffer("target", torch.zeros(1, dtype=torch.float64))
-
-    def running_cost(self, t, state, applied, exogenous):
-        return super().running_cost(
-            t, torch.cat([state[..., :1] - self.target, state[..., 1:]], -1), applied, exogenous
-        )
-
-
-def test_it_flies_to_a_target_that_has_moved():
-    plant = Movable()
-    start, inputs = torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)
-    controller = control(plant)
-    still = controller.fly(start, inputs).states[0, -1, 0].item()
-    plant.target.fill_(0.7)
-    moved, anew = (each.fly(start, inputs).states for each in (controller, control(plant)))
-    torch.testing.assert_close(moved, anew, rtol=1e-9, atol=1e-12)
-    assert abs(still) < 1e-6 and moved[0, -1, 0] > 0.2
 
 
 def test_it_plans_on_the_closure_as_it_is_trained():
@@ -325,13 +300,6 @@ def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
         wanted = by_rollout(plant, plan, state, exogenous, hold=hold, start=start)
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
-
-
-def test_a_cost_without_finite_ranges_is_refused():
-    plant = LinearQuadratic()
-    plant.actions = (Signal(symbol="a", name="force", unit="N"),)
-    with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
-        CommandCost(plant, plant.closure, 10)
 
 
 def test_a_descent_goes_round_points_where_the_cost_is_not_finite():

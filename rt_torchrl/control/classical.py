@@ -49,10 +49,9 @@ class ClassicalController(nn.Module, ABC):
         values = torch.tensor(self.default_gains if gains is None else gains, dtype=torch.float64)
         if len(values) != len(self.gain_units) or not (values.isfinite() & (values > 0)).all():
             units = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items()) or "none"
-            given = f"default_gains={self.default_gains}" if gains is None else f"gains={gains}"
             raise ValueError(
-                f"{given} of {type(self).__name__} must be positive and finite: {units}, one for each entry of "
-                "gain_units."
+                f"gains={tuple(values.tolist())} of {type(self).__name__} must be positive and finite, one for each "
+                f"entry of gain_units: {units}."
             )
         self.plant = plant
         self.log_gains = nn.Parameter(values.log(), requires_grad=False)

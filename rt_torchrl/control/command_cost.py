@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import SmoothClip
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.code import IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
@@ -78,28 +79,21 @@ class CommandCost:
         hold: number m of control intervals for which a command is held; the last may be held for fewer.
 
     Raises:
-        ValueError: if an action has no finite range, episodes of the plant may end early, ``hold`` is
-            below 1 or a weight is not in double precision.
+        ValueError: if an action has no finite range, episodes of the plant may end early, or a weight is not in double
+            precision.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, n: int, *, hold: int = 1):
         require_double("closure", closure)
-        low, high = bounds(plant.actions)
-        unbounded = [a.name for a, span in zip(plant.actions, (high - low).tolist(), strict=True) if span == torch.inf]
-        if unbounded:
-            raise ValueError(
-                f"actions {', '.join(unbounded)} of plant {plant.name!r} have no finite range; give them low and high."
-            )
+        ranges = SmoothClip(plant.actions)  # which refuses infinite ones
         if plant.end_cost is not None:
             raise ValueError(
                 f"episodes of plant {plant.name!r} may end early, which optimal commands do not consider: leave out "
                 "model predictive control."
             )
-        if hold < 1:
-            raise ValueError(f"hold={hold} must be at least 1 control interval.")
         self.plant, self.n, self.hold = plant, n, hold
         self.interval = PenalisedInterval(plant, closure)
-        self._low, self._span = low.numpy(), (high - low).numpy()
+        self._low, self._span = ranges.low.numpy(), (ranges.high - ranges.low).numpy()
         self._first = np.arange(0, n, hold)
         self._code: IntervalCode | None = None
 
@@ -172,28 +166,6 @@ class Minimum(NamedTuple):
     gradient: np.ndarray
 
 
-class _Objective:
-    """The function that L-BFGS-B calls; it remembers the best point."""
-
-    def __init__(self, evaluate: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray):
-        self._evaluate = evaluate
-        cost, gradient = evaluate(start)
-        if not (np.isfinite(cost) and np.isfinite(gradient).all()):
-            raise FloatingPointError("the cost or its gradient is not finite at the start of the descent.")
-        self.best, self._scale = Minimum(start, cost, gradient), abs(cost) or 1.0
-
-    def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        trial = self.best
-        if not (flat == trial.point.ravel()).all():  # L-BFGS-B begins at the start, whose cost is known
-            point = flat.reshape(trial.point.shape)
-            trial = Minimum(point.copy(), *self._evaluate(point))
-            if not (np.isfinite(trial.cost) and np.isfinite(trial.gradient).all()):
-                return DIVERGED, np.zeros_like(flat)
-            if trial.cost < self.best.cost:
-                self.best = trial
-        return trial.cost / self._scale, trial.gradient.ravel() / self._scale
-
-
 def descend(
     evaluate: Callable[[Float[np.ndarray, "..."]], tuple[float, Float[np.ndarray, "..."]]],
     start: Float[np.ndarray, "..."],
@@ -218,7 +190,26 @@ def descend(
     """
     from scipy.optimize import fmin_l_bfgs_b  # here, because it takes a second to load and --help need not wait for it
 
-    objective = _Objective(evaluate, start)
+    def finite(trial: Minimum) -> bool:
+        return bool(np.isfinite(trial.cost) and np.isfinite(trial.gradient).all())
+
+    best = Minimum(start, *evaluate(start))
+    scale = abs(best.cost) or 1.0
+    if not finite(best):
+        raise FloatingPointError("the cost or its gradient is not finite at the start of the descent.")
+
+    def objective(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal best
+        trial = best
+        if not (flat == trial.point.ravel()).all():  # L-BFGS-B begins at the start, whose cost is known
+            point = flat.reshape(start.shape)
+            trial = Minimum(point.copy(), *evaluate(point))
+            if not finite(trial):
+                return DIVERGED, np.zeros_like(flat)
+            if trial.cost < best.cost:
+                best = trial
+        return trial.cost / scale, trial.gradient.ravel() / scale
+
     with _libraries().limit(limits=1, user_api="blas"):
         fmin_l_bfgs_b(  # ``minimize`` converts the bounds two times more, in a tenth of a solve of a short window
             objective,
@@ -230,7 +221,7 @@ def descend(
             maxiter=iterations,
             maxfun=2 * iterations + 20,
         )
-    return objective.best
+    return best
 
 
 @functools.cache

@@ -70,17 +70,9 @@ class DISCON(ClassicalController):
         self._read = [place_of("state that DISCON reads", name, plant.readings, plant.name) for name in READ]
         self._wind = place_of("input that DISCON reads", "wind_speed", plant.inputs, plant.name)
         # The original stays loaded, so that the copies find the libraries that lie beside it.
-        self._original = loaded(self.library)
+        loaded(self.library)
         self._flying: list[_Copy] = []
         self._intervals = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy has, in this process or another one; it loads the library itself, and begins episodes."""
-        return {**self.__dict__, "_original": None, "_flying": [], "_intervals": 0}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._original = loaded(self.library)
 
     def begin(self) -> None:
         """Begin episodes with libraries that remember nothing."""
@@ -132,7 +124,7 @@ class DISCON(ClassicalController):
         self.begin()
         for k in range(exogenous.shape[1]):
             t, state, inputs = k * plant.dt, states[-1], exogenous[:, k]
-            command = self.act(t, state[:, : len(plant.readings)], inputs)
+            command = self.act(t, *plant.sensed(state, inputs))
             end, action = plant.step(state.new_full((len(state),), t), state, command, inputs, closure)
             states.append(held(plant, state, end))
             applied.append(action)

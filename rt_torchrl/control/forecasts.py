@@ -1,7 +1,7 @@
 """Forecasts of the exogenous inputs over a planning horizon."""
 
 import math
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -10,20 +10,13 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.shapes import Input, Inputs
 
-
-@runtime_checkable
-class Forecast(Protocol):
-    """Anything that forecasts the exogenous inputs."""
-
-    def __call__(self, t: float, exogenous: Input, n: int) -> Inputs:
-        """The inputs of the n control intervals from t [s] on, of which the first are measured."""
+Forecast = Callable[[float, Input, int], Inputs]
+"""A function of time t [s], measured inputs and n: the inputs of the n control intervals from t on."""
 
 
-class Held:
-    """The measured input, held."""
-
-    def __call__(self, t: float, exogenous: Input, n: int) -> Inputs:
-        return exogenous.unsqueeze(1).expand(-1, n, -1)
+def held(t: float, exogenous: Input, n: int) -> Inputs:
+    """The measured inputs, held."""
+    return exogenous.unsqueeze(1).expand(-1, n, -1)
 
 
 class Decaying(nn.Module):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.control.command_cost import CommandCost, Plan, descend
-from rt_torchrl.control.forecasts import Decaying, Forecast, Held
+from rt_torchrl.control.forecasts import Decaying, Forecast, held
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import AtLeastOne, NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant
@@ -88,16 +88,9 @@ class RecedingHorizon:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        closure: nn.Module,
-        config: PredictiveConfig,
-        *,
-        forecast: Forecast | None = None,
-    ):
+    def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig, *, forecast: Forecast | None = None):
         self.plant, self.config = plant, config
-        self.forecast: Forecast = forecast or Held()
+        self.forecast: Forecast = forecast or held
         hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
         self.horizon = self._whole("horizon", config.length(plant), hold)
         self.period = hold if config.period is None else self._whole("period", config.period, hold)
@@ -227,10 +220,8 @@ class PredictiveControl(nn.Module):
         devices = {str(weight.device) for weight in (*closure.parameters(), *closure.buffers())} - {"cpu"}
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
-        self.forecast: Forecast = Held()
-        if config.forecast == "decaying":
-            forever = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
-            self.forecast = Decaying(torch.zeros_like(forever), forever, dt=plant.dt)  # which holds, too
+        forever = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
+        self.forecast = Decaying(torch.zeros_like(forever), forever, dt=plant.dt)  # which holds, until it has learned
         self._acting = RecedingHorizon(plant, closure, config, forecast=self.forecast)
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
@@ -247,7 +238,7 @@ class PredictiveControl(nn.Module):
             records: inputs of whole episodes.
         """
         plant = self._acting.plant
-        if not isinstance(self.forecast, Decaying) or not plant.inputs:
+        if self._acting.config.forecast == "held" or not plant.inputs:
             return
         horizon = min(self._acting.horizon, records.shape[1] - 1) * plant.dt
         self.forecast.load_state_dict(Decaying.fitted(records, dt=plant.dt, horizon=horizon).state_dict())

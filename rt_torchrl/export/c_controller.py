@@ -1,6 +1,7 @@
 """A controller as a C99 file: from the measured signals of a plant to its action, with filters and integrals."""
 
 import ctypes
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,7 @@ from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_cl
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.c_source import CSource, literal
-from rt_torchrl.programs.tracer import Tracer
 
-TOLERANCE = 1e-9
-"""Greatest difference of a controller in C from that in torch, as a share of the action's range."""
 INTERVALS = 1000
 """Greatest number of control intervals of the flight on which both are compared."""
 
@@ -48,8 +46,7 @@ def export_controller(policy: nn.Module, path: Path | str, plant: Plant, *, name
     """
     name = f"{plant.name}_controller" if name is None else name
     path = c_file.require_names(path, name)
-    written = CController(Controller(plant, detached(policy, plant)), name)
-    return c_file.write_c(path, name, written.comment(), written.declarations(), written.source(), written.fly)
+    return CController(Controller(plant, detached(policy, plant)), name).write(path)
 
 
 class CController:
@@ -66,43 +63,44 @@ class CController:
     def __init__(self, controller: Controller, name: str):
         self.controller, self.name, plant = controller, name, controller.plant
         self.parts = _traced(controller)
-        functions = [function for function, _ in self.parts.values()]
-        self.read = sorted(set().union(*(f.reads(word) for f in functions for word in ("measured", "last"))))
+        read = (f.reads(word) for f in self.parts.values() for word in ("measured", "last"))
+        self.read = sorted(set().union(*read))
         signals = [*(plant.states[k] for k in controller.measured), *plant.inputs]
         self.signals = [signals[k] for k in self.read]
         lengths = {"command": len(plant.actions), "memory": len(controller.held), "last": len(self.signals)}
-        self.arrays = {array: n for array, n in lengths.items() if n}
+        self.arrays = {array: max(1, n) for array, n in lengths.items()}  # C has no empty arrays
 
     def source(self) -> CSource:
         """The functions ``init`` and ``step``, and those that they call."""
-        name, source = self.name, c_file.source_of("policy", self.controller.policy)
+        name, source = self.name, c_file.source_of(self.controller.policy)
         dt, places = literal(self.controller.plant.dt), dict.fromkeys(("measured", "last"), self.read)
-        calls = {}
-        for part, (function, example) in self.parts.items():
-            head = c_file.add_function(source, f"{name}_{part}", function, example, places, kind="static void")
-            terms = {"memory": "0", "last": "0", "next": "state->memory"}  # 0 where there is no such array
-            terms |= {array: f"state->{array}" for array in self.arrays}
+        calls, terms = {}, {"next": "state->memory"} | {array: f"state->{array}" for array in self.arrays}
+        for part, function in self.parts.items():
+            head = c_file.add_function(source, f"{name}_{part}", function, places, kind="static void")
             terms["t"] = f"{dt} * (double)(state->steps - 1)" if part == "advance" else f"{dt} * (double)state->steps"
             arguments = re.findall(r"(\w+)(?=[,)])", head)
             calls[part] = f"{name}_{part}({', '.join(terms.get(word, word) for word in arguments)});"
         last = [f"state->last[{k}] = measured[{k}];" for k in range(len(self.signals))]
         rest = [f"state->command[{k}] = 0.0;" for k in range(self.arrays["command"])]
-        held = bool(self.controller.held)
-        head = f"void {name}_init({name}_state *state, const double *measured)"
-        source.write(head, [*([calls["start"]] if held else []), "state->steps = 0;", *rest, *last])
-        before = [f"if (state->steps > 0) {calls['advance']}"] if held else []
-        head = f"void {name}_step({name}_state *state, const double *measured, double *action)"
-        source.write(head, [*before, calls["act"], *last, "state->steps += 1;"])
+        start, before = [], []
+        if self.controller.held:
+            start, before = [calls["start"]], [f"if (state->steps > 0) {calls['advance']}"]
+        init, step = (head.rstrip(";") for head in self.declarations()[-2:])
+        source.write(init, [*start, "state->steps = 0;", *rest, *last])
+        source.write(step, [*before, calls["act"], *last, "state->steps += 1;"])
         return source
+
+    def write(self, path: Path) -> float | None:
+        """Write the file and its header after a flight, see :func:`~rt_torchrl.export.c_file.write_c`."""
+        return c_file.write_c(path, self.name, self.comment(), self.declarations(), self.source(), self.fly)
 
     def declarations(self) -> list[str]:
         """The state of a controller and the functions."""
         name = self.name
-        says = {"command": " /* what the policy asked for last */", "last": " /* what was measured last */"}
         return [
             "typedef struct {",
             "    unsigned long long steps; /* control intervals since the start */",
-            *(f"    double {array}[{n}];{says.get(array, '')}" for array, n in self.arrays.items()),
+            *(f"    double {array}[{n}];" for array, n in self.arrays.items()),
             f"}} {name}_state;",
             "",
             f"void {name}_init({name}_state *state, const double *measured);",
@@ -118,19 +116,13 @@ class CController:
             "rt_torchrl. It allocates nothing and needs only math.h. Each controller has a state of its own.",
             "",
             f"    {name}_state state;",
-            f"    double measured[{max(1, len(self.signals))}], action[{len(plant.actions)}];",
-            "    ...read measured...",
-            f"    {name}_init(&state, measured);",
-            f"    ...every {plant.dt:g} s read measured...",
-            f"    {name}_step(&state, measured, action);",
-            "",
-            "init is called once, before the first step. step is called at the start of every control interval, over",
-            "which its action is held.",
+            f"    double measured[{self.arrays['last']}], action[{len(plant.actions)}];",
+            f"    {name}_init(&state, measured);            once, before the first step",
+            f"    {name}_step(&state, measured, action);    every {plant.dt:g} s, over which the action is held",
             "",
             *c_file.signal_table({"measured": self.signals, "action": plant.actions, "state.memory": held}),
             "",
-            "The action is what the actuators make of the command of the policy, such as within rate limits. The",
-            "command is in state.command.",
+            "The action is what the actuators make of state.command, the command of the policy.",
             *(MEMORY if held else []),
         ]
 
@@ -139,7 +131,7 @@ class CController:
         """Fly the plant by the controller in C, and give the same measurements to the controller in torch.
 
         Raises:
-            ValueError: if the two differ by more than ``TOLERANCE``.
+            ValueError: if the two differ by more than the tolerance.
         """
         controller, plant = self.controller, self.controller.plant
         generator = torch.Generator().manual_seed(SEED)
@@ -161,8 +153,8 @@ class CController:
             if not state.isfinite().all():  # the plant has left its range; what follows is no flight
                 break
         of_c, of_torch = (torch.cat(actions) for actions in zip(*flown, strict=True))
-        what, rows = f"the controller {self.name} in C", [f"interval {k}" for k in range(len(of_c))]
-        return require_close(of_c, of_torch, action_sizes(plant, of_torch), TOLERANCE, plant.actions, what, rows)
+        what, of = f"the controller {self.name} in C", action_sizes(plant, of_torch)
+        return require_close(of_c, of_torch, of, c_file.TOLERANCE, plant.actions, what)
 
     def _call(
         self, library: ctypes.CDLL, part: str, in_c: Any, measured: Tensor, inputs: Tensor, count: int = 0
@@ -179,8 +171,8 @@ MEMORY = (
 )
 
 
-def _traced(controller: Controller) -> dict[str, tuple[c_file.TracedFunction, dict[str, Tensor]]]:
-    """The function ``act``; of a controller with states also ``start`` and ``advance``; examples of their arguments.
+def _traced(controller: Controller) -> dict[str, c_file.TracedFunction]:
+    """The function ``act``; of a controller with states also ``start`` and ``advance``.
 
     Measured states and inputs are one argument, ``measured``; those of the interval before are ``last``.
     """
@@ -192,29 +184,26 @@ def _traced(controller: Controller) -> dict[str, tuple[c_file.TracedFunction, di
         return {"next": controller.start(measured[:, :n], measured[:, n:])}
 
     def act(t: Tensor, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
-        return dict(
-            zip(("command", "action"), controller.act(t, memory, measured[:, :n], measured[:, n:]), strict=True)
-        )
+        command, action = controller.act(t, memory, measured[:, :n], measured[:, n:])
+        return {"command": command, "action": action}
 
     def advance(t: Tensor, memory: Tensor, last: Tensor, command: Tensor, measured: Tensor) -> dict[str, Tensor]:
         following = measured[:, :n]
         return {"next": controller.advance(t, memory, last[:, :n], last[:, n:], command, following)}
 
     now = {"t": state.new_zeros(1), "memory": state[:, controller.held], "measured": measured}
-    parts = {"act": (c_file.traced(what, act, now, controller.policy), now)}
+    parts = {"act": c_file.traced(what, act, now, controller.policy)}
     if not controller.held:
         return parts
-    parts["start"] = c_file.traced(what, start, {"measured": measured}), {"measured": measured}
+    parts["start"] = c_file.traced(what, start, {"measured": measured})
     with torch.no_grad():
         example = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
         example["measured"] = measured
-        controller.closure = unknown = UnknownClosure(plant.closure)
-        try:
-            advance(**example)
-            parts["advance"] = c_file.traced(what, advance, example, prepare=unknown.begin), example
-        finally:
-            controller.closure = plant.closure
-    if parts["advance"][0].reads("closure"):
+        controller.closure = UnknownClosure(plant.closure)
+        known = advance(**example)["next"].isfinite().all()
+        parts["advance"] = c_file.traced(what, advance, example)
+        controller.closure = plant.closure
+    if not known:
         raise ValueError(
             f"{what} cannot be exported: its states ({', '.join(plant.controller_states)}) depend on the closure, "
             "which a controller does not know. Name in controller_states only what follows from measured signals."
@@ -223,23 +212,14 @@ def _traced(controller: Controller) -> dict[str, tuple[c_file.TracedFunction, di
 
 
 class UnknownClosure(nn.Module):
-    """A closure whose values are inputs named ``closure`` of a program, after one call with values."""
+    """A closure of unknown coefficients, so that all that depends on them is NaN."""
 
     def __init__(self, closure: nn.Module):
         super().__init__()
         self.closure = closure
-        self._shapes: list[torch.Size] = []
-        self._tracer: Tracer | None = None
-
-    def begin(self, tracer: Tracer) -> None:
-        """Go on with inputs of a tracer."""
-        self._tracer = tracer
+        self._count: int | None = None
 
     def forward(self, features: Tensor) -> Tensor:
-        if self._tracer is None:
-            values: Tensor = self.closure(features)
-            self._shapes.append(values.shape)
-            return values
-        values = torch.zeros(self._shapes.pop(0), dtype=torch.float64)
-        self._tracer.input(values, "closure")
-        return values
+        if self._count is None:
+            self._count = self.closure(features).shape[-1]
+        return features.new_full((*features.shape[:-1], self._count), math.nan)

@@ -1,6 +1,5 @@
 """Functions of tensors as a C99 file with its header: traced, compiled, called, and written after a comparison."""
 
-import contextlib
 import ctypes
 import math
 import re
@@ -8,9 +7,9 @@ import shutil
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,12 +19,13 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.programs.c_source import CSource
 from rt_torchrl.programs.program import Program, UntraceableError
 from rt_torchrl.programs.rules import new_tracer
-from rt_torchrl.programs.tracer import Tracer
 
+NOTE = "It has no memory, allocates nothing, may be called from several threads, and needs only math.h."
 COMPILERS = ("cc", "gcc", "clang")
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+TOLERANCE = 1e-9
+"""Greatest difference of a number in C from that in torch, as a share of the range or size of its signal."""
 REMEDY = "Write it with arithmetic of torch in float64; the formats pt2 and onnx take more of a policy than C does."
-Result = TypeVar("Result")
 
 
 class TracedFunction(NamedTuple):
@@ -33,10 +33,12 @@ class TracedFunction(NamedTuple):
 
     Args:
         program: the program; its inputs have the name of an argument and a position.
+        arguments: example of every argument. Those of one dimension are numbers in C, those of two are arrays.
         outputs: values of every output.
     """
 
     program: Program
+    arguments: Mapping[str, Tensor]
     outputs: dict[str, list[int]]
 
     def reads(self, name: str) -> set[int]:
@@ -51,8 +53,6 @@ def traced(
     function: Callable[..., Mapping[str, Tensor]],
     arguments: Mapping[str, Tensor],
     module: nn.Module | None = None,
-    *,
-    prepare: Callable[[Tracer], None] | None = None,
 ) -> TracedFunction:
     """Trace a function of vectors, one realisation.
 
@@ -61,60 +61,34 @@ def traced(
         function: function of tensors that returns tensors by name.
         arguments: example of every argument, with one realisation.
         module: module from :func:`~rt_torchrl.export.agreement.frozen` whose weights the C file holds.
-        prepare: called with the tracer before the function is.
 
     Raises:
         UntraceableError: if the function cannot become a program; the message names the reason and the line.
     """
-    tracer, entered = new_tracer(), list[str]()
-    inputs = {name: value.clone() for name, value in arguments.items()}
+    tracer, inputs = new_tracer(), {name: value.clone() for name, value in arguments.items()}
     try:
         for name, value in inputs.items():
             tracer.input(value, name)
         for weight in [] if module is None else module.parameters():
             tracer.weight(weight)
-        if prepare is not None:
-            prepare(tracer)
-        with torch.no_grad(), tracer.following(), _noted(module, entered):
+        with torch.no_grad(), tracer.following():
             results = function(**inputs)
         outputs = {name: tracer.outputs(value) for name, value in results.items()}
     except UntraceableError as error:
-        layer = f"layer {entered[-1]} of " if entered else ""
-        raise UntraceableError(f"{layer}{what} cannot be written in C: {error}. {REMEDY}") from error
-    return TracedFunction(tracer.program, outputs)
+        raise UntraceableError(f"{what} cannot be written in C: {error}. {REMEDY}") from error
+    return TracedFunction(tracer.program, arguments, outputs)
 
 
-@contextlib.contextmanager
-def _noted(module: nn.Module | None, entered: list[str]) -> Iterator[None]:
-    """A context in which ``entered`` holds the names of the layers whose call has begun and not ended."""
-    hooks = []
-    for path, layer in [] if module is None else module.named_modules():
-        if path:
-            name = f"{path!r} ({type(layer).__name__})"
-            hooks.append(layer.register_forward_pre_hook(lambda *_, name=name: entered.append(name)))
-            hooks.append(layer.register_forward_hook(lambda *_: entered.pop() and None))
-    try:
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()
-
-
-def source_of(role: str, module: nn.Module) -> CSource:
+def source_of(module: nn.Module) -> CSource:
     """The beginning of a C file, with the weights of a module in the order in which :func:`traced` numbers them."""
-    return CSource(
-        [
-            (f"{role} {name} {tuple(weight.shape)}", weight.detach().flatten().tolist())
-            for name, weight in module.named_parameters()
-        ]
-    )
+    weights = {f"{name} {tuple(x.shape)}": x.detach().flatten().tolist() for name, x in module.named_parameters()}
+    return CSource(list(weights.items()))
 
 
 def add_function(
     source: CSource,
     name: str,
     function: TracedFunction,
-    example: Mapping[str, Tensor],
     places: Mapping[str, Sequence[int]] | None = None,
     kind: str = "void",
 ) -> str:
@@ -124,12 +98,11 @@ def add_function(
         source: the C file.
         name: name in C.
         function: the traced function.
-        example: its arguments. Those of one dimension are numbers in C, those of two are arrays.
         places: positions of the elements of an argument that its array in C has; by default all.
         kind: what stands before the name.
     """
     inputs, declared = dict[tuple[str, int], str](), list[str]()
-    for argument, value in example.items():
+    for argument, value in function.arguments.items():
         if value.ndim == 1:
             declared.append(f"double {argument}")
             inputs[argument, 0] = argument
@@ -204,8 +177,8 @@ def write_c(
     comment: Sequence[str],
     declarations: Sequence[str],
     source: CSource,
-    compare: Callable[[ctypes.CDLL], Result],
-) -> Result | None:
+    compare: Callable[[ctypes.CDLL], float],
+) -> float | None:
     """Write a C file and its header of the same name, after they were compiled and compared with what they are made of.
 
     Args:
@@ -280,5 +253,4 @@ def signal_table(arrays: Mapping[str, Sequence[Signal]]) -> list[str]:
         for array, signals in arrays.items()
         for k, signal in enumerate(signals)
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return ["  ".join(row) for row in rows]

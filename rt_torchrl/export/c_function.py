@@ -1,31 +1,57 @@
 """A policy, and a twin's control interval, as C99 functions that need nothing but the mathematics of the C library."""
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.export import c_file
 from rt_torchrl.export.agreement import (
+    OBSERVATIONS,
     SEED,
+    action_sizes,
     detached,
     frozen,
     require_close,
-    require_policy,
     sample_observations,
     sizes,
 )
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import bounds
+from rt_torchrl.plants.signal import Signal, bounds
 
-Function = Callable[..., dict[str, Tensor]]
-TOLERANCE = 1e-9
-"""Greatest difference of a state in C from that in torch, as a share of the greatest size of the state."""
 FLIGHTS, INTERVALS = 20, 20
 """Flights under random commands on which a twin is compared, and their lengths."""
+
+
+Exported = tuple[Callable[..., Mapping[str, Tensor]], Mapping[str, Tensor], Tensor, Tensor]
+"""A function, its arguments at the points of the comparison, and its values and their sizes there."""
+
+
+def _write(
+    path: Path,
+    name: str,
+    what: str,
+    module: nn.Module,
+    functions: Mapping[str, Exported],
+    signals: Sequence[Signal],
+    comment: Sequence[str],
+) -> float | None:
+    """Write functions of signals, by their names in C, with the weights of a module; return the greatest difference."""
+    source, heads = c_file.source_of(module), []
+    for called, (function, points, _, _) in functions.items():
+        example = {argument: x[:1] for argument, x in points.items()}
+        heads.append(c_file.add_function(source, called, c_file.traced(what, function, example, module)))
+
+    def compare(library: ctypes.CDLL) -> float:
+        errors = []
+        for called, (_, points, expected, of) in functions.items():
+            values = c_file.answers(getattr(library, called), points, len(signals))
+            errors.append(require_close(values, expected, of, c_file.TOLERANCE, signals, f"{called} in C"))
+        return max(errors)
+
+    return c_file.write_c(path, name, comment, [f"{head};" for head in heads], source, compare)
 
 
 def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str | None = None) -> float | None:
@@ -53,39 +79,29 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
     """
     name = f"{plant.name}_policy" if function is None else function
     path, policy = c_file.require_names(path, name), detached(policy, plant)
-    source = c_file.source_of("policy", policy)
-    example = {"observation": sample_observations(plant.observations, 1)}
-    what = f"policy {type(policy).__name__}"
-    program = c_file.traced(what, lambda observation: {"action": policy(observation)}, example, policy)
-    head = c_file.add_function(source, name, program, example)
+    points = sample_observations(plant.observations, OBSERVATIONS)
+    with torch.no_grad():
+        expected = policy(points)
 
-    def compare(library: ctypes.CDLL) -> float:
-        def compiled(rows: Tensor) -> Tensor:
-            return c_file.answers(getattr(library, name), {"observation": rows}, len(plant.actions))
+    def act(observation: Tensor) -> dict[str, Tensor]:
+        return {"action": policy(observation)}
 
-        return require_policy(policy, compiled, plant, "the C function")
-
-    macros = [
-        f"#define {name.upper()}_OBSERVATIONS {len(plant.observations)}",
-        f"#define {name.upper()}_ACTIONS {len(plant.actions)}",
-    ]
-    return c_file.write_c(path, name, _about_policy(policy, plant, name), [*macros, "", f"{head};"], source, compare)
+    functions = {name: (act, {"observation": points}, expected, action_sizes(plant, expected))}
+    what, comment = f"policy {type(policy).__name__}", _about_policy(policy, plant, name)
+    return _write(path, name, what, policy, functions, plant.actions, comment)
 
 
 def _about_policy(policy: nn.Module, plant: Plant, name: str) -> list[str]:
     kind = type(plant)
     return [
         f"{name}: a policy of the plant {plant.name} ({type(policy).__name__}), written by rt_torchrl.",
-        "",
         f"Call it once every {plant.dt:g} s, the plant's control interval, and hold the action in between.",
-        "It has no memory, allocates nothing, may be called from several threads, and needs only math.h.",
+        c_file.NOTE,
         "A NaN in an observation gives NaN in every action that depends on it: check your sensors before.",
         "",
         *c_file.signal_table({"observation": plant.observations, "action": plant.actions}),
         *(f"observation[{k}] is {m.scaling}." for k, m in enumerate(plant.observed) if m.scaling),
-        "",
         f"Observations are made of states and inputs by {kind.__name__}.observe, in {kind.__module__}.",
-        "A range of observations is where they usually lie; actions never leave theirs, if the policy saturates.",
     ]
 
 
@@ -125,37 +141,19 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
     def rest(read: Tensor) -> dict[str, Tensor]:
         return {"state": plant.at_rest(read)}
 
-    functions: dict[str, tuple[Function, dict[str, Tensor], Tensor]] = {f"{name}_step": (step, points, ends)}
+    # The sizes of a flight that runs away say nothing of others.
+    of = torch.maximum(ends.abs(), sizes(ends[:FLIGHTS]))
+    functions: dict[str, Exported] = {f"{name}_step": (step, points, ends, of)}
     if plant.unread:
         read = points["state"][:, : len(plant.readings)]
-        functions[f"{name}_rest"] = (rest, {"read": read}, plant.at_rest(read).detach())
-    source = c_file.source_of("closure", closure)
-    heads = []
-    for called, (function, inputs, _) in functions.items():
-        example = {argument: x[:1] for argument, x in inputs.items()}
-        part = c_file.traced(f"the twin of plant {plant.name!r}", function, example, closure)
-        heads.append(c_file.add_function(source, called, part, example))
-
-    def compare(library: ctypes.CDLL) -> float:
-        errors = []
-        for called, (_, inputs, expected) in functions.items():
-            values = c_file.answers(getattr(library, called), inputs, len(plant.states))
-            rows = [
-                dict(zip(inputs, row, strict=True)) for row in zip(*(x.tolist() for x in inputs.values()), strict=True)
-            ]
-            what = f"{called} in C"
-            # The sizes of a flight that runs away say nothing of others.
-            of = torch.maximum(expected.abs(), sizes(expected[:FLIGHTS]))
-            errors.append(require_close(values, expected, of, TOLERANCE, plant.states, what, rows))
-        return max(errors)
-
-    return c_file.write_c(
-        path, name, _about_twin(plant, closure, name), [f"{head};" for head in heads], source, compare
-    )
+        start = plant.at_rest(read).detach()
+        functions[f"{name}_rest"] = rest, {"read": read}, start, sizes(start)
+    what, comment = f"the twin of plant {plant.name!r}", _about_twin(plant, closure, name)
+    return _write(path, name, what, closure, functions, plant.states, comment)
 
 
 @torch.no_grad()
-def _flights(plant: Plant, closure: nn.Module) -> tuple[dict[str, Tensor], Float[Tensor, "n n_s"]]:
+def _flights(plant: Plant, closure: nn.Module) -> tuple[dict[str, Tensor], Tensor]:
     """Times, states, commands and inputs of many intervals, and the states at their ends."""
     generator, n = torch.Generator().manual_seed(SEED), min(plant.n_steps, INTERVALS)
     state, exogenous = plant.draw_initial_state(FLIGHTS, generator), plant.draw_exogenous(FLIGHTS, generator)
@@ -170,22 +168,15 @@ def _flights(plant: Plant, closure: nn.Module) -> tuple[dict[str, Tensor], Float
 
 
 def _about_twin(plant: Plant, closure: nn.Module, name: str) -> list[str]:
-    read, total = len(plant.readings), len(plant.states)
-    rest = [
-        f"No sensor reads the last {plant.unread} of the states. At the start of an episode they follow:",
-        "",
-        f"    {name}_rest(read, state);    read has the first {read} states, state all {total}, maybe in its place",
-        "",
-    ]
+    read = len(plant.readings)
+    rest = f"{name}_rest(read, state) gives all states at the start of an episode, of the first {read}, which are read."
     return [
         f"{name}: a twin of the plant {plant.name} with the closure {type(closure).__name__}, written by rt_torchrl.",
+        f"{name}_step(t, state, command, exogenous, next) takes the state over one control interval of {plant.dt:g} s,",
+        "which starts at t [s], under a held command and held inputs; next may be state.",
+        *([rest] if plant.unread else []),
+        c_file.NOTE,
+        "A state that leaves the range of a table becomes NaN.",
         "",
-        f"    {name}_step(t, state, command, exogenous, next);    next may be state",
-        "",
-        f"It takes the state over one control interval of {plant.dt:g} s, which starts at t [s]. Command and exogenous",
-        "inputs are held. It has no memory, allocates nothing, may be called from several threads, and needs only",
-        "math.h. A state that leaves the range of a table becomes NaN.",
-        "",
-        *(rest if plant.unread else []),
         *c_file.signal_table({"state": plant.states, "command": plant.actions, "exogenous": plant.inputs}),
     ]

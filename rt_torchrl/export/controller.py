@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.export.agreement import frozen
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import differences
+from rt_torchrl.plants.signal import differences, place_of
 
 
 class Controller:
@@ -37,15 +37,9 @@ class Controller:
     def __init__(self, plant: Plant, policy: nn.Module):
         self.plant, self.policy = frozen(plant), policy
         self.closure: nn.Module = self.plant.closure
-        names = [signal.name for signal in plant.states]
-        unknown = [name for name in plant.controller_states if name not in names]
-        if unknown:
-            raise ValueError(
-                f"controller_states of plant {plant.name!r} names {', '.join(unknown)}; its states are "
-                f"{', '.join(names)}."
-            )
-        self.held = [names.index(name) for name in plant.controller_states]
-        self.measured = [k for k in range(len(names)) if k not in self.held]
+        names = plant.controller_states
+        self.held = [place_of("controller_states", name, plant.states, plant.name) for name in names]
+        self.measured = [k for k in range(len(plant.states)) if k not in self.held]
         self._order = torch.tensor([*self.measured, *self.held]).argsort()
         self._moving = copy.deepcopy(self.plant)
 

@@ -13,10 +13,11 @@ from torch import nn
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached
 from rt_torchrl.export.c_controller import CController
-from rt_torchrl.export.c_file import STRICT, compile_c, compiler, require_names, write_c
+from rt_torchrl.export.c_file import STRICT, compile_c, compiler, require_names
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.export.fmu import SUFFIXES
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import place_of
 from rt_torchrl.programs.c_source import literal
 
 
@@ -96,8 +97,7 @@ def export_discon(policy: nn.Module, path: Path | str, plant: Plant, *, name: st
     words = {"NAME": name} | _words(controller, *places)
     with tempfile.TemporaryDirectory() as folder:
         inner, outer = Path(folder, "controller.c"), Path(folder, path.name)
-        parts = controller.comment(), controller.declarations(), controller.source()
-        agreement = write_c(inner, name, *parts, controller.fly)
+        agreement = controller.write(inner)
         header, template = inner.with_suffix(".h"), files("rt_torchrl.export").joinpath("discon.c")
         _, _, functions = inner.read_text(encoding="utf-8").partition(f'#include "{header.name}"')
         text = template.read_text(encoding="utf-8")
@@ -115,14 +115,10 @@ def places_of(plant: Plant) -> tuple[int, int]:
     """The places of torque and pitch among the actions of a turbine.
 
     Raises:
-        ValueError: if the plant has other actions.
+        ValueError: if it lacks one of them.
     """
-    names = [signal.name for signal in plant.actions]
-    if sorted(names) != sorted(ACTIONS):
-        raise ValueError(
-            f"plant {plant.name!r} has the actions {', '.join(names)}; a DISCON demands {' and '.join(ACTIONS)}."
-        )
-    return names.index(ACTIONS[0]), names.index(ACTIONS[1])
+    torque, pitch = (place_of("action of a DISCON", name, plant.actions, plant.name) for name in ACTIONS)
+    return torque, pitch
 
 
 def _words(controller: CController, torque: int, pitch: int) -> dict[str, str]:

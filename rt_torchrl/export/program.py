@@ -1,13 +1,11 @@
 """A policy as a PyTorch program, which torch alone can load, or as an ONNX model for other run-time systems."""
 
-import contextlib
-import importlib
+import importlib.util
 import io
 import json
-import logging
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,25 +69,39 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         ValueError: if a package of the extra ``export`` is missing, the policy does not fit the plant or has no ONNX
             form, onnxruntime cannot run the model, or the model does not agree with the policy.
     """
-    require_onnx()
-    policy, name = detached(policy, plant), type(policy).__name__
+    for package in ONNX_PACKAGES:
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(
+                f"ONNX needs the package {package}: install the extra, uv run --extra export or pip install "
+                "'rt_torchrl[export]'; or take the .pt2 program or C."
+            )
+    import onnxruntime
+
+    policy = detached(policy, plant)
     program = _traced(policy, plant)
     options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
     try:
-        with _quiet():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
             exported = torch.onnx.export(
                 program, (), dynamo=True, verbose=False, dynamic_shapes=({0: "batch"},), **options
             )
-    except Exception as error:  # the exporter raises several kinds
+        assert exported is not None  # the exporter of dynamo gives a program; only the older one gives none
+        model = exported.model_proto
+        entry = model.metadata_props.add()
+        entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
+        content = model.SerializeToString()
+        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    except Exception as error:  # exporter and onnxruntime raise several kinds
         raise ValueError(
-            f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
+            f"policy {type(policy).__name__} has no ONNX form that onnxruntime runs in double precision: "
+            f"{str(error).strip()}. Use the .pt2 program or C instead."
         ) from error
-    assert exported is not None  # the exporter of dynamo gives a program; only the older one gives none
-    model = exported.model_proto
-    entry = model.metadata_props.add()
-    entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
-    content = model.SerializeToString()
-    difference = require_policy(policy, onnx_runtime(content, name), plant, "the ONNX model")
+
+    def run(rows: Tensor) -> Tensor:
+        return torch.from_numpy(session.run(["action"], {"observation": rows.numpy()})[0])
+
+    difference = require_policy(policy, run, plant, "the ONNX model")
     write_atomically(Path(path), content)
     return difference
 
@@ -98,7 +110,7 @@ def _traced(policy: nn.Module, plant: Plant) -> ExportedProgram:
     """The graph of a policy for any number of observations, ``(batch, n_o) -> (batch, n_a)``.
 
     Raises:
-        ValueError: if torch.export cannot trace the policy, or the policy draws random numbers.
+        ValueError: if torch.export cannot trace the policy.
     """
     name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
     try:
@@ -110,9 +122,6 @@ def _traced(policy: nn.Module, plant: Plant) -> ExportedProgram:
             f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
             "torch.where, and sizes such that any batch can be passed."
         ) from error
-    for node in program.graph.nodes:
-        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
-            raise ValueError(f"policy {name} draws random numbers ({node.target}); export its mean instead.")
     return program
 
 
@@ -137,51 +146,3 @@ def interface(plant: Plant) -> dict[str, Any]:
         "observation": [signal | more for signal, more in zip(described(plant.observations), observed, strict=True)],
         "action": described(plant.actions),
     }
-
-
-def require_onnx() -> None:
-    """Refuse to go on without the packages of the extra ``export``.
-
-    Raises:
-        ValueError: if a package is not installed.
-    """
-    for package in ONNX_PACKAGES:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ValueError(
-                f"ONNX needs the package {package}: install the extra, uv run --extra export or pip install "
-                "'rt_torchrl[export]'; or take the .pt2 program or C."
-            ) from error
-
-
-def onnx_runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
-    """A model as a function of a batch of observations.
-
-    Raises:
-        ValueError: if onnxruntime cannot run the model.
-    """
-    import onnxruntime
-
-    try:
-        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    except Exception as error:  # the errors of onnxruntime have no common class
-        raise ValueError(
-            f"onnxruntime cannot run policy {policy} in double precision: {str(error).strip()}. Use the .pt2 program "
-            "or C instead."
-        ) from error
-    return lambda rows: torch.from_numpy(session.run(["action"], {"observation": rows.numpy()})[0])
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """A context without the exporter's notices, of a missing torchvision and of outdated functions in torch itself."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            yield
-    finally:
-        logger.setLevel(level)

@@ -110,10 +110,6 @@ class LaggedActuator(Actuator):
             mean = mean + off * share
         return replaced(applied, self.place, mean), torch.stack(ends, -1)
 
-    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
-        before = torch.cat([applied[..., self.place : self.place + 1], hidden[..., :-1]], -1)
-        return (before - hidden) * self.stages / self.coefficients(closure)[0]
-
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., -1])
 
@@ -160,13 +156,6 @@ class ResonantActuator(Actuator):
         rate = v * (cosine - decay * sine) - omega * omega * off * sine
         mean = demand - (rate - v + 2.0 * decay * (end - off)) / (omega * omega * self.dt)
         return replaced(applied, self.place, mean), torch.stack([demand + end, rate], -1)
-
-    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
-        x, v = hidden.unbind(-1)
-        omega, odds = self.coefficients(closure).unbind()
-        zeta = odds / (1.0 + odds)
-        pull = omega * omega * (applied[..., self.place] - x)
-        return torch.stack([v, pull - 2.0 * zeta * omega * v], -1)
 
     def rest(self, base: State) -> Hidden:
         position = super().rest(base)[..., 0]
@@ -238,29 +227,22 @@ class PositionedActuator(Actuator):
     Args:
         base: the plant.
         action: name of the action.
-        size: what the motion is limited by, in the unit that :attr:`unit` says.
+        size: what the motion is limited by, in the unit of the action, of a rate per second.
 
     Raises:
         ValueError: if there is no such action, or the size is not positive and finite.
     """
 
-    unit = ""
-    """Unit of the size, after that of the action."""
-
     def __init__(self, base: Plant, action: str, size: float):
         self.size, signal = size, _signal_of(base, action)
         if not 0.0 < size < math.inf:
-            raise ValueError(f"size={size} {signal.unit}{self.unit} of {action} must be positive and finite.")
+            raise ValueError(f"size={size} of {action} must be positive and finite.")
         position = Signal(symbol=signal.symbol + "'", name=f"position_of_{action}", unit=signal.unit)
         super().__init__(base, action, [position])
 
     def moved(self, x: Cost, demand: Cost) -> Cost:
         """The position at the end of an interval in which an action is asked for."""
         raise NotImplementedError
-
-    def initial_position(self, x: Cost, demand: Cost) -> Cost:
-        """The position that acts at the start of an interval; by default that of its end: the motion takes no time."""
-        return self.moved(x, demand)
 
     def mean(self, x: Cost, end: Cost, demand: Cost) -> Cost:
         """The mean position over the interval; by default that of its end."""
@@ -272,7 +254,8 @@ class PositionedActuator(Actuator):
         return replaced(applied, self.place, self.mean(x, end, demand)), end.unsqueeze(-1)
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
-        return replaced(applied, self.place, self.initial_position(hidden[..., 0], applied[..., self.place]))
+        """By default the position at the end of the interval: the motion takes no time."""
+        return replaced(applied, self.place, self.moved(hidden[..., 0], applied[..., self.place]))
 
 
 class RateLimitedActuator(PositionedActuator):
@@ -282,7 +265,7 @@ class RateLimitedActuator(PositionedActuator):
     ``size`` is r.
     """
 
-    unit = "/s"
+    acting = Actuator.acting
 
     def moved(self, x: Cost, demand: Cost) -> Cost:
         return x + (demand - x).clamp(-self.size * self.dt, self.size * self.dt)
@@ -290,9 +273,6 @@ class RateLimitedActuator(PositionedActuator):
     def mean(self, x: Cost, end: Cost, demand: Cost) -> Cost:
         moving = ((demand - x).abs() / (self.size * self.dt)).clamp(max=1.0)
         return end - 0.5 * moving * (end - x)
-
-    def initial_position(self, x: Cost, demand: Cost) -> Cost:
-        return x
 
 
 class PlayActuator(PositionedActuator):

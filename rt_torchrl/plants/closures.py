@@ -58,10 +58,9 @@ class PositiveCoefficients(nn.Module):
         shape = (len(self.names),)
         if coefficients.shape != shape or not (coefficients.isfinite() & (coefficients > 0.0)).all():
             expected = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
-            known = f"; those of the real system are {self.true_coefficients}" if self.true_coefficients else ""
             raise ValueError(
-                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {expected}, positive and "
-                f"finite{known}."
+                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {expected}, each positive "
+                "and finite."
             )
         self.factor = factor
         if factor is None:
@@ -124,8 +123,10 @@ class BoundedPerceptron(nn.Module):
         super().__init__()
         low, high = torch.tensor(ranges, dtype=torch.float64, device=generator.device).unbind(-1)
         bound = torch.tensor(bounds, dtype=torch.float64, device=generator.device)
-        if not (low < high).all() or not (bound > 0.0).all():
-            raise ValueError(f"ranges={ranges} must each go from low to high, and bounds={bounds} must be positive.")
+        if not (low < high).all() or not ((bound > 0.0) & bound.isfinite()).all():
+            raise ValueError(
+                f"ranges={ranges} must each go from low to high, and bounds={bounds} be positive and finite."
+            )
         self.network = mlp(len(ranges), hidden, len(bounds), generator=generator)
         nn.init.zeros_(self.network[-1].get_parameter("weight"))
         self.register_buffer("middle", 0.5 * (low + high))

@@ -147,14 +147,9 @@ class Extension(Plant):
         return closure.get_submodule("base") if self._parameterised else closure
 
     def coefficients(self, closure: nn.Module) -> Float[Tensor, " n"]:
-        """The extension's own coefficients in a closure.
-
-        Raises:
-            TypeError: if its parameters are no :class:`PositiveCoefficients`.
-        """
+        """The extension's own coefficients in a closure, of one whose parameters are :class:`PositiveCoefficients`."""
         w = closure.get_submodule("own")
-        if not isinstance(w, PositiveCoefficients):
-            raise TypeError(f"parameters={type(w).__name__} of {type(self).__name__} must be PositiveCoefficients.")
+        assert isinstance(w, PositiveCoefficients), f"the parameters of {type(self).__name__}"
         return w.coefficients
 
     def law(self, closure: nn.Module) -> nn.Module:
@@ -209,16 +204,12 @@ class Extension(Plant):
 
 def _delegated(part: str, method: str) -> Callable[..., Any]:
     """A method of an extension that asks the plant for its answer."""
-    names = tuple(inspect.signature(getattr(Plant, method)).parameters)[1:]
+    signature = inspect.signature(getattr(Plant, method))
 
-    def answer(extension: Extension, *arguments: Any, **named: Any) -> Any:
-        values = dict(zip(names, arguments, strict=False)) | named
-        if values.keys() != {*names} or len(arguments) > len(names):
-            raise TypeError(
-                f"{method} of {type(extension).__name__} takes {', '.join(names)}; ask the plant, of class "
-                f"{type(extension.innermost).__name__}, for what else it takes."
-            )
-        return extension.ask(part, method, {name: values[name] for name in names})
+    def answer(*arguments: Any, **named: Any) -> Any:
+        values = signature.bind(*arguments, **named).arguments
+        extension: Extension = values.pop("self")
+        return extension.ask(part, method, values)
 
     return answer
 
@@ -281,14 +272,13 @@ class Catalogue(NamedTuple):
         missing = ", ".join(name for name in names if name not in self.systems)
         if missing:
             raise ValueError(f"unknown={tuple(names)}: {missing} does not exist; choose {', '.join(self.systems)}.")
-        changes: dict[str, tuple[str, Change]] = {}
+        changes: dict[str, Change] = {}
         for name in names:
-            for part, change in self.systems[name].items():
-                if part in changes:
-                    both = f"{changes[part][0]} and {name} both change the {part}"
-                    raise ValueError(f"unknown={tuple(names)}: {both}; give one of them.")
-                changes[part] = name, change
-        return {part: change for part, (_, change) in changes.items()}
+            twice = changes.keys() & self.systems[name].keys()
+            if twice:
+                raise ValueError(f"unknown={tuple(names)}: two of them change the {' and the '.join(twice)}.")
+            changes |= self.systems[name]
+        return changes
 
     def __call__(self, plant: Plant, names: Sequence[str]) -> Plant:
         """The plant, which a twin knows, with all that the named systems have beside it.

@@ -140,15 +140,14 @@ class Plant(nn.Module):
             raise ValueError(f"observe={observe!r} of plant {cls.name!r} must be a sequence of names, not a text.")
         known, sets = {measurement.name: measurement for measurement in cls.measurements}, cls.observation_sets
         observe = observe or tuple(sets)[:1] or tuple(known)
-        unknown = [name for name in observe if name not in known and name not in sets]
+        names = dict.fromkeys(name for word in observe for name in sets.get(word, (word,)))
+        unknown = [name for name in names if name not in known]
         if unknown:
             raise ValueError(
                 f"observe={tuple(observe)} of plant {cls.name!r}: {', '.join(unknown)} does not exist; choose among "
                 f"the sets {', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
             )
-        return tuple(
-            known[name] for name in dict.fromkeys(name for word in observe for name in sets.get(word, (word,)))
-        )
+        return tuple(known[name] for name in names)
 
     @property
     def acting_inputs(self) -> tuple[Signal, ...]:
@@ -241,7 +240,7 @@ class Plant(nn.Module):
         """
         if not self.observed:
             raise NotImplementedError(f"plant {self.name!r} declares no measurements and defines no observe().")
-        values = [measurement.observed(self, t, state, exogenous) for measurement in self.observed]
+        values = [(m.read(self, t, state, exogenous) - m.offset) / m.scale for m in self.observed]
         _, *values = torch.broadcast_tensors(state[..., 0], *values)
         return torch.stack(values, -1)
 
@@ -271,13 +270,9 @@ class Plant(nn.Module):
         By default these are :attr:`state_sizes`, and infinite for :attr:`controller_states`, which say no more than the
         measured states that they follow from; a plant may override them.
         """
-        names = [signal.name for signal in self.states]
-        sizes = self.state_sizes or (1.0,) * len(names)
-        if len(sizes) != len(names):  # which :meth:`discrepancy` refuses
-            return sizes
-        return tuple(
-            math.inf if name in self.controller_states else size for name, size in zip(names, sizes, strict=True)
-        )
+        sizes = self.state_sizes or (1.0,) * len(self.states)
+        computed = [k for k, signal in enumerate(self.states) if signal.name in self.controller_states]
+        return tuple(math.inf if k in computed else size for k, size in enumerate(sizes))
 
     def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
         r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`.
@@ -292,10 +287,10 @@ class Plant(nn.Module):
         scales = self.discrepancy_scales
         if len(scales) != len(self.states) or not all(scale > 0.0 for scale in scales):
             named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
-            argument = (
-                "state_sizes" if type(self).discrepancy_scales is Plant.discrepancy_scales else "discrepancy_scales"
+            raise ValueError(
+                f"discrepancy_scales={scales} of plant {self.name!r}, by default its state_sizes, must have one "
+                f"positive number each: {named}."
             )
-            raise ValueError(f"{argument}={scales} of plant {self.name!r} must have one positive number each: {named}.")
         compared = [k for k, scale in enumerate(scales) if scale < math.inf]
         signals = [self.states[k] for k in compared]
         difference = differences(signals, state[..., compared], measured[..., compared])

@@ -5,7 +5,6 @@ They saturate by the paper's smooth clip (eq. clip), which maps x = 0 to the mid
 .. math:: \mathrm{clip}(x, a_{lo}, a_{hi}) = \tfrac12(\tanh x + 1)(a_{hi} - a_{lo}) + a_{lo}
 """
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -31,13 +30,12 @@ class SmoothClip(nn.Module):
 
     def __init__(self, actions: Sequence[Signal], *, device: torch.device | None = None):
         super().__init__()
-        for action in actions:
-            if not (math.isfinite(action.low) and math.isfinite(action.high)):
-                raise ValueError(
-                    f"action {action.name!r} has range [{action.low}, {action.high}] {action.unit}; "
-                    "a saturated policy needs finite bounds: give the Signal a low and a high."
-                )
         low, high = bounds(actions, device=device)
+        if not (low.isfinite() & high.isfinite()).all():
+            raise ValueError(
+                f"the ranges of {', '.join(f'{a.name} [{a.low}, {a.high}] {a.unit}' for a in actions)} must be finite: "
+                "give each Signal a low and a high."
+            )
         self.register_buffer("low", low)
         self.register_buffer("high", high)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.plants.extension import Extension, FurtherInputs
+from rt_torchrl.plants.extension import Extension, FurtherInputs, replaced
 from rt_torchrl.plants.plant import Plant, Transition, with_memories
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.shapes import Action, Hidden, Input, Observation, State, Time
@@ -90,10 +90,7 @@ class BiasedSensor(Extension):
 
     def true(self, read: Float[Tensor, "*batch n_b"], bias: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch n_b"]:
         """States of the plant, from what the sensors read."""
-        shift = torch.zeros_like(read)
-        return read - torch.cat(
-            [shift[..., : self.place], bias.unsqueeze(-1) + shift[..., :1], shift[..., self.place + 1 :]], -1
-        )
+        return replaced(read, self.place, read[..., self.place] - bias)
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         readings, _ = self.split(state)

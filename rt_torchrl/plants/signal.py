@@ -5,9 +5,9 @@ An observation is a measurement y from an offset, in units of a scale, so that i
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -48,14 +48,10 @@ class Signal:
             raise ValueError(f"Signal name={self.name!r} must be an identifier such as 'rotor_speed'; rename it.")
         for end in ("low", "high"):
             require_number(end, getattr(self, end), finite=False)
-        if not self.low < self.high:
+        if not self.low < self.high or (self.periodic and math.isinf(self.period)):
             raise ValueError(
-                f"Signal {self.name!r} has low={self.low}, high={self.high} [{self.unit}]; low must be below high."
-            )
-        if self.periodic and not math.isfinite(self.period):
-            raise ValueError(
-                f"Signal {self.name!r} is periodic with low={self.low}, high={self.high} [{self.unit}]; both must be "
-                "finite, one turn apart."
+                f"Signal {self.name!r} has low={self.low}, high={self.high} [{self.unit}]; low must be below high, and "
+                "both finite, one turn apart, if it is periodic."
             )
 
     @property
@@ -115,19 +111,9 @@ def bounds(
     return low, high
 
 
-@runtime_checkable
-class Read(Protocol):
-    """Computes a measurement of a plant from the time, the state and the exogenous input: any such function will do."""
-
-    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        """The value, of the shape of ``state[..., 0]``, or one that is broadcast to it.
-
-        Args:
-            plant: the plant, with its parameters.
-            t: time [s].
-            state: states of the plant.
-            exogenous: exogenous inputs of the interval.
-        """
+Read = Callable[[Any, Tensor, Tensor, Tensor], Tensor]
+"""Computes a measurement of plant, time [s], state and exogenous input, in the shape of ``state[..., 0]`` or broadcast
+to it: any such function will do."""
 
 
 @dataclass(frozen=True)
@@ -141,15 +127,8 @@ class Named:
     name: str
 
     def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        for signals, values in ((plant.states, state), (plant.acting_inputs, exogenous)):
-            for place, signal in enumerate(signals):
-                if signal.name == self.name:
-                    return values[..., place]
-        known = ", ".join(signal.name for signal in (*plant.states, *plant.acting_inputs))
-        raise ValueError(
-            f"measurement {self.name!r} of plant {plant.name!r} is none of its states and inputs {known}; give it a "
-            "function read(plant, t, state, exogenous)."
-        )
+        place = place_of("measurement", self.name, (*plant.states, *plant.acting_inputs), plant.name)
+        return state[..., place] if place < len(plant.states) else exogenous[..., place - len(plant.states)]
 
 
 def state_read(read: Read, states: Sequence[Signal]) -> int | None:
@@ -176,11 +155,10 @@ class Phase:
     period: float
 
     def __post_init__(self) -> None:
-        if self.of not in ("cosine", "sine"):
-            raise ValueError(f"of={self.of!r} of a Phase must be cosine or sine.")
-        require_number("period", self.period)
-        if not self.period > 0.0:
-            raise ValueError(f"period={self.period} s of a Phase must be positive.")
+        if self.of not in ("cosine", "sine") or not 0.0 < self.period < math.inf:
+            raise ValueError(
+                f"of={self.of!r} of a Phase must be cosine or sine, and period={self.period} s positive and finite."
+            )
 
     def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         turn = 2.0 * math.pi / self.period * t
@@ -277,10 +255,6 @@ class Measurement(Signal):
         if (self.offset, self.scale) == (0.0, 1.0):
             return ""
         return f"({self.name} - {self.offset:.9g} {self.unit}) / {self.scale:.9g} {self.unit}"
-
-    def observed(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        """The observation (y − offset)/scale."""
-        return (self.read(plant, t, state, exogenous) - self.offset) / self.scale
 
 
 class StateBounds:

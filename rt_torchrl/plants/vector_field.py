@@ -11,7 +11,7 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Input, State, Time
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Signal, place_of
 
 Range = tuple[float, float]
 
@@ -84,8 +84,8 @@ class NeuralResidual(Extension):
         seed: seed of the first weights of N.
 
     Raises:
-        ValueError: if a name does not exist or stands twice, a residual is not positive and finite, a range is missing
-            or empty, or a state is computed by the controller or read by no sensor.
+        ValueError: if a name does not exist, a residual is not positive and finite, a range is missing or empty, or a
+            state is computed by the controller or read by no sensor.
     """
 
     def __init__(
@@ -98,8 +98,13 @@ class NeuralResidual(Extension):
         hidden: Sequence[int] = (8,),
         seed: int = 0,
     ):
-        bounds = _bounds(base, greatest)
-        signals, limits = _signals(base, inputs), dict(ranges or {})
+        if not greatest or not inputs:
+            raise ValueError(
+                f"greatest={dict(greatest)} and inputs={tuple(inputs)} must name a signal of the plant each."
+            )
+        bounds, known = _bounds(base, greatest), (*base.actions, *base.states, *base.acting_inputs)
+        places = [place_of("inputs", name, known, base.name) for name in inputs]
+        signals, limits = [(place, known[place]) for place in places], dict(ranges or {})
         spare = [name for name in limits if name not in inputs]
         if spare:
             raise ValueError(f"ranges: {quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
@@ -146,31 +151,11 @@ class NeuralResidual(Extension):
 
 def _bounds(base: Plant, greatest: Mapping[str, float]) -> list[float]:
     """Greatest residual of each state that has one [state unit / s]."""
-    known, inner = [s.name for s in base.readings if s.name not in base.controller_states], base.innermost
+    read, inner = [s for s in base.readings if s.name not in base.controller_states], base.innermost
     sizes = dict(zip((state.name for state in inner.states), inner.state_sizes, strict=False))
-    if not greatest or not set(greatest) <= set(known):
-        raise ValueError(
-            f"greatest={dict(greatest)} must name states of plant {base.name!r} that a sensor reads and no controller "
-            f"computes; choose some of {quoted(known)}."
-        )
-    for name, value in greatest.items():
-        if not 0.0 < value < math.inf:
-            raise ValueError(f"greatest={value} of {name!r} must be positive and finite, in sizes per second.")
+    for name in greatest:
+        place_of("greatest", name, read, base.name)  # which refuses what no sensor reads, or a controller computes
     return [value * sizes.get(name, 1.0) for name, value in greatest.items()]
-
-
-def _signals(base: Plant, inputs: Sequence[str]) -> list[tuple[int, Signal]]:
-    """The signals of these names, with their places among actions, states and inputs."""
-    known: dict[str, tuple[int, Signal]] = {}
-    for place, signal in enumerate((*base.actions, *base.states, *base.acting_inputs)):
-        known.setdefault(signal.name, (place, signal))
-    missing = [name for name in inputs if name not in known]
-    if missing or not inputs or len(set(inputs)) < len(inputs):
-        raise ValueError(
-            f"inputs={tuple(inputs)} of the residual must name signals of plant {base.name!r}, each once; choose some "
-            f"of {quoted(list(known))}."
-        )
-    return [known[name] for name in inputs]
 
 
 def _scaled(signal: Signal, limits: Range | None) -> list[Range]:
