@@ -205,7 +205,7 @@ def test_what_is_no_library_is_refused(tmp_path):
         ((plant, nothing, tmp_path / "DISCON.IN"), r"input_file='.*DISCON\.IN' of DISCON does not exist"),
         ((plant, text), r"library='.*text\.so' of DISCON cannot be loaded here"),
         ((plant, nothing), r"library='.*nothing\.so' has no function DISCON"),
-        ((LinearQuadratic(), nothing), "action of a DISCON='generator_torque' of plant .* does not exist; choose one of force"),
+        ((LinearQuadratic(), nothing), "action of a DISCON='generator_torque'.*choose one of force"),
     ):
         with pytest.raises(ValueError, match=words):
             DISCON(*arguments)
