@@ -197,16 +197,12 @@ def test_products_are_made_in_pieces(driver, monkeypatch):
 class Following(LinearQuadratic):
     """Its state is what was commanded, and not what it was before."""
 
-    own_scheme = True
-
     def advance(self, t, state, action, exogenous, closure):
         return torch.cat([action, 2.0 * action], -1)
 
 
 class Free(LinearQuadratic):
     """It moves by itself: nothing that acts on it, and no weight, enters its step."""
-
-    own_scheme = True
 
     def advance(self, t, state, action, exogenous, closure):
         return state * torch.tensor([0.9, 0.8], dtype=torch.float64)

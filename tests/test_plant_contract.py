@@ -40,7 +40,7 @@ def plant(kind):
     return shortened(kind, 50)
 
 
-def test_a_scheme_of_its_own_is_found_by_what_a_step_does():
+def test_a_scheme_of_its_own_is_one_that_a_plant_defines():
     class Own(LinearQuadratic):
         def advance(self, t, state, applied, exogenous, closure):
             return state + self.dt * self.vector_field(t, state, applied, exogenous, closure)
@@ -49,6 +49,8 @@ def test_a_scheme_of_its_own_is_found_by_what_a_step_does():
         advance = LinearQuadratic.advance
 
     class Wrapping(LinearQuadratic):
+        own_scheme = False
+
         def advance(self, *given):
             return super().advance(*given)
 

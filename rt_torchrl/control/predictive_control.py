@@ -214,6 +214,8 @@ class PredictiveControl(nn.Module):
         ValueError: if :class:`RecedingHorizon` refuses the parameters, or the closure is not on the CPU.
     """
 
+    virtual_episodes = PredictiveConfig.virtual_episodes
+
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
         super().__init__()
         self.closure = closure
@@ -225,11 +227,6 @@ class PredictiveControl(nn.Module):
         self._acting = RecedingHorizon(plant, closure, config, forecast=self.forecast)
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
-
-    @property
-    def virtual_episodes(self) -> int:
-        """Number of virtual episodes that it flies at a time."""
-        return self._acting.config.virtual_episodes
 
     def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.

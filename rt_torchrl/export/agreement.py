@@ -27,17 +27,13 @@ def sample_observations(signals: Sequence[Signal], count: int) -> Float[Tensor, 
     and clipped to a bound that it has. Observations are scaled to order one, so that these numbers reach the middle of
     a policy and its saturated ends.
     """
-    generator, columns = torch.Generator().manual_seed(SEED), []
-    for signal in signals:
-        uniform, exponent = torch.rand(2, count, generator=generator, dtype=torch.float64)
-        unbounded = torch.randn(count, generator=generator, dtype=torch.float64) * 0.1 * 300.0**exponent
-        if math.isfinite(signal.low) and math.isfinite(signal.high):
-            column = signal.low + (signal.high - signal.low) * uniform
-        else:
-            column = unbounded.clamp(signal.low, signal.high)
-        column[0] = min(max(0.0, signal.low), signal.high)
-        columns.append(column)
-    return torch.stack(columns, -1)
+    generator, shape = torch.Generator().manual_seed(SEED), (count, len(signals))
+    uniform, exponent = torch.rand(2, *shape, generator=generator, dtype=torch.float64)
+    unbounded = torch.randn(shape, generator=generator, dtype=torch.float64) * 0.1 * 300.0**exponent
+    low, high = bounds(signals)
+    samples = torch.where((high - low).isfinite(), low + (high - low) * uniform, unbounded.clamp(low, high))
+    samples[0] = torch.zeros_like(low).clamp(low, high)
+    return samples
 
 
 def frozen(module: Module) -> Module:

@@ -103,7 +103,8 @@ class Extension(Plant):
         """Whether hidden states follow their exact solution between samples, or the plant has its own scheme."""
         if type(self).advance is Plant.advance:
             return False
-        return len(self.states) > len(self.base.states) or self.base.own_scheme or super().own_scheme
+        differs = type(self).advance is not Extension.advance or type(self).step is not Plant.step
+        return differs or len(self.states) > len(self.base.states) or self.base.own_scheme
 
     # The additional dynamics
 

@@ -20,7 +20,6 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -31,7 +30,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import rk4_step, whole_steps
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Ended, Input, Inputs, Observation, State, States, Time
-from rt_torchrl.plants.signal import Measurement, Preview, Signal, bounds, differences
+from rt_torchrl.plants.signal import Measurement, Preview, Signal, differences
 
 
 class Transition(NamedTuple):
@@ -168,11 +167,10 @@ class Plant(nn.Module):
     def own_scheme(self) -> bool:
         """Whether :meth:`step` has a scheme of its own, where other ones would integrate another system.
 
-        A plant that overrides neither :meth:`step` nor :meth:`advance` has none. Of another plant, the interval is
-        computed both ways, at states and inputs that it draws.
+        It is that of a plant that overrides :meth:`step` or :meth:`advance`. One that takes a Runge-Kutta step in spite
+        of it sets ``own_scheme = False``.
         """
-        kind = type(self)
-        return not (kind.step is Plant.step and kind.advance is Plant.advance) and not _steps_by_runge_kutta(self)
+        return type(self).step is not Plant.step or type(self).advance is not Plant.advance
 
     @property
     def horizon(self) -> float:
@@ -377,20 +375,6 @@ class Plant(nn.Module):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
-
-
-@torch.no_grad()
-def _steps_by_runge_kutta(plant: Plant) -> bool:
-    """Whether an interval of the plant is a Runge-Kutta step of its vector field, which it may wrap, to rounding."""
-    device = next((tensor.device for tensor in (*plant.buffers(), *plant.parameters())), torch.device("cpu"))
-    generator = torch.Generator(device=device).manual_seed(0)
-    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
-    t = torch.zeros(1, dtype=state.dtype, device=device)
-    low, high = bounds(plant.actions, device=device)
-    command = (low + 0.3 * (high - low)).nan_to_num(0.0, 0.0, 0.0).expand(2, -1)
-    end = plant.step(t, state, command, exogenous, plant.closure).state
-    runge_kutta = plant.step_by(partial(Plant.advance, plant), t, state, command, exogenous, plant.closure).state
-    return torch.allclose(end, runge_kutta, rtol=1e-12, atol=1e-12)
 
 
 def require_end_cost(plant: Plant) -> None:

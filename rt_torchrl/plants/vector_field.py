@@ -113,10 +113,13 @@ class NeuralResidual(Extension):
             scaled += _scaled(signal, limits.get(name))
         network = ResidualRates(scaled, bounds, hidden=hidden, generator=torch.Generator().manual_seed(seed))
         super().__init__(base, [], network)
-        self._whole = not base.own_scheme
         self._inputs = signals
         names = list(greatest)
         self._rates = [names.index(s.name) if s.name in names else None for s in base.states]
+
+    @property
+    def own_scheme(self) -> bool:
+        return self.base.own_scheme
 
     def residual(self, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """What the network adds to the rates of all states [state unit / s]."""
@@ -138,7 +141,7 @@ class NeuralResidual(Extension):
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """One Runge-Kutta step of the sum, or the plant's own scheme between two halves of the residual's step."""
-        if self._whole:
+        if not self.own_scheme:
             return Plant.advance(self, t, state, applied, exogenous, closure)
         half = 0.5 * self.dt
 
