@@ -55,14 +55,15 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
     try:
         actions, again = policy(observations), policy(observations)
+        kind, shape = actions.dtype, tuple(actions.shape)
     except Exception as error:  # any error of the user's module
         raise ValueError(
             f"policy {name} cannot take float64 observations of shape {tuple(observations.shape)} of plant "
             f"{plant.name!r}: {error}"
         ) from error
-    if actions.shape != (3, len(plant.actions)) or actions.dtype != torch.float64:
+    if shape != (3, len(plant.actions)) or kind != torch.float64:
         raise ValueError(
-            f"policy {name} returns {actions.dtype} {tuple(actions.shape)} for 3 observations of plant {plant.name!r}; "
+            f"policy {name} returns {kind} {shape} for 3 observations of plant {plant.name!r}; "
             f"it must return torch.float64 (3, {len(plant.actions)}). A module becomes double by .double()."
         )
     if not torch.allclose(actions, again, rtol=0.0, atol=0.0, equal_nan=True):
