@@ -3,6 +3,7 @@
 import importlib.util
 import io
 import json
+import logging
 import math
 import warnings
 from collections.abc import Sequence
@@ -79,6 +80,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
 
     policy = detached(policy, plant)
     program = _traced(policy, plant)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of a missing torchvision
     options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
     try:
         with warnings.catch_warnings():
