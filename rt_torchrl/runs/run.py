@@ -16,6 +16,7 @@ from rt_torchrl import figures
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.checks import engine_gap, require_agreement
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealEpisodes, mean_with_confidence
@@ -28,12 +29,13 @@ from rt_torchrl.runs.dashboard import Dashboard, Progress
 from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
-from rt_torchrl.runs.run_start import known_physics, start_of, twin_of
+from rt_torchrl.runs.run_start import known_physics, start_of
 from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.steps.config import ROLES, Role
+from rt_torchrl.steps.hypotheses.ensemble import make_twin
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
 from rt_torchrl.steps.plan import MakePlanner, make_planner
-from rt_torchrl.steps.start import first_live
+from rt_torchrl.steps.start import EarlierPolicies, FirstController, first_live
 from rt_torchrl.steps.switch import MakeReferee, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.operation import Operation
@@ -155,8 +157,12 @@ class Run:
         policies = {role: policy.to(self.device) for role, policy in config.make_policies(physics, generator).items()}
         closure = config.make_closure(physics, generator).to(self.device)
         policies = config.acting_policies(policies, physics, closure)
-        first = self._start(physics, closure)
-        table, twin = config.twinning, twin_of(config, physics, closure, first)
+        table, first = config.twinning, self._start
+        if config.start == "mpc":
+            first = FirstController(PredictiveControl(physics, closure, table.planner.receding_horizon))
+        twin = make_twin(physics, closure, table.hypotheses, engine=config.engine)
+        if isinstance(first, EarlierPolicies):
+            first.hand_over(twin)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         if config.asynchronous:
             env = real_side.operation_of(config, env, make_env, physics, policies, first=first)

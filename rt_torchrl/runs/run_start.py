@@ -1,14 +1,11 @@
 """What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import nn
 
 from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.unseen import Baseline, RealController
 from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
@@ -22,46 +19,35 @@ from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length
-from rt_torchrl.trajectories.twin import DigitalTwin
-
-MakesStart = Callable[[Plant, nn.Module], Start | None]
-"""Function of the twin's physics and closure, both on their device, that makes the start."""
 
 
-def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> MakesStart:
-    """Read and check what ``config.start`` names.
+def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> Start | None:
+    """Read and check what ``config.start`` names; None for random weights, and where predictive control flies first.
 
     A run that goes on from a checkpoint has begun already: the flights of a log are in it, so that the log is not read
     again. What has flown first may act again.
 
     Args:
         config: options of the run.
-        plant: physics of the twin, for which policies and controllers are made.
+        plant: physics of the twin on its device, for which policies and controllers are made.
         controller: class of the classical controller that the real system has had so far, if it has had one.
-
-    Returns:
-        Function that makes the start.
 
     Raises:
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start or "random"
-    if name == "random":
-        return lambda physics, closure: None
+    if name in ("random", "mpc"):
+        return None
     if name == "controller":
         if controller is None:
             raise ValueError("start='controller' needs the controller: give Run(..., first=...), or start='random'.")
-        law = controller(plant).to(config.device)
-        return lambda physics, closure: FirstController(law)
-    if name == "mpc":
-        options = config.twinning.planner.receding_horizon
-        return lambda physics, closure: FirstController(PredictiveControl(physics, closure, options))
+        return FirstController(controller(plant).to(config.device))
     path = Path(name)
     if path.is_dir():
         return _of_run(path, config, plant)
     is_log = path.suffix.lower() in READERS
     if is_log and config.resume and config.log_dir is not None and checkpoints(config.log_dir):
-        return lambda physics, closure: None
+        return None
     if is_log and path.is_file():
         return _of_log(path, config, plant)
     raise ValueError(
@@ -70,15 +56,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     )
 
 
-def twin_of(config: RunConfig, physics: Plant, closure: nn.Module, first: Start | None) -> DigitalTwin:
-    """The twin of a run, with the hypotheses of an earlier one that it begins with."""
-    twin = make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine)
-    if isinstance(first, EarlierPolicies):
-        first.hand_over(twin)
-    return twin
-
-
-def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
+def _of_run(folder: Path, config: RunConfig, plant: Plant) -> EarlierPolicies:
     where = f"start={str(folder)!r} is a run"
     name = read_settings(folder)["plant"]
     if name != plant.name:
@@ -92,36 +70,28 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
                 f"{where} whose {what} are {', '.join(map(str, earlier))}; here they are "
                 f"{', '.join(map(str, present))}. Give the options of that run, such as --observe, or another start."
             )
-    closure = config.make_closure(plant, torch.Generator())
+    closure, hypotheses = config.make_closure(plant, torch.Generator()), None
     try:
         closure.load_state_dict(run.closure.state_dict())
-    except RuntimeError as error:
-        raise ValueError(
-            f"{where} whose closure does not fit that of this run: {error}. Give its --closure."
-        ) from error
-    twin, hypotheses = make_twin(plant, closure, config.twinning.hypotheses), None
-    if isinstance(run.twin, TwinEnsemble) and isinstance(twin, TwinEnsemble):
-        hypotheses = run.twin.state_dict()["hypotheses"]
-        try:
+        twin = make_twin(plant, closure, config.twinning.hypotheses)
+        if isinstance(run.twin, TwinEnsemble) and isinstance(twin, TwinEnsemble):
+            hypotheses = run.twin.state_dict()["hypotheses"]
             twin.load_hypotheses(hypotheses)
-        except ValueError as error:
-            if run.twin.hypothesis is not None:
-                raise ValueError(
-                    f"{where} that believes {run.twin.hypothesis!r}, but {error} Give the "
-                    "--twinning.hypotheses.which of that run, or none to plan on the twin alone."
-                ) from error
-            hypotheses = None
-    arm, live = run.config.twinning.arm, run.live
-    policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
-
-    def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
-        on_device = {role: policy.to(config.device) for role, policy in policies.items()}
-        return EarlierPolicies(on_device, run.closure.to(config.device), live, hypotheses)
-
-    return start
+    except RuntimeError as error:
+        raise ValueError(f"{where} whose closure does not fit that of this run; give its --closure. {error}") from error
+    except ValueError as error:
+        if run.twin.hypothesis is not None:
+            raise ValueError(
+                f"{where} that believes {run.twin.hypothesis!r}, but {error} Give the "
+                "--twinning.hypotheses.which of that run, or none to plan on the twin alone."
+            ) from error
+        hypotheses = None
+    arm = run.config.twinning.arm
+    policies = {role: run.policies[role].to(config.device) for role in ROLES if arm in ("twinning", role)}
+    return EarlierPolicies(policies, run.closure.to(config.device), run.live, hypotheses)
 
 
-def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
+def _of_log(path: Path, config: RunConfig, physics: Plant) -> RecordedFlights:
     options = config.log
     columns = [Column.parse(text) for text in options.columns]
     log = checked(read_log(path, physics, columns), physics, drop=options.drop)
@@ -129,11 +99,7 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
     shortest = max(SHORTEST, config.twinning.learner.return_steps)
     segments = resample(log, physics, gap=options.gap, shortest=shortest).segments
     records = pieces_of_equal_length(segments, physics.n_steps, physics.dt)
-
-    def start(physics: Plant, closure: nn.Module) -> RecordedFlights:
-        return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
-
-    return start
+    return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
 
 
 CHECKED_STEPS = 10
