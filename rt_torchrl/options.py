@@ -109,7 +109,8 @@ def _sentence(entry: Any, options: type) -> str:
         return f"{name} is missing."
     if kind == "literal_error":
         return f"{name}={entry['input']!r} does not exist; choose {entry['ctx']['expected'].replace(chr(39), '')}."
-    _, _, allowed = entry["msg"].partition(" ")  # such as: Input should be greater than 0
+    _, _, allowed = entry["msg"].replace("should", "must").partition(" ")  # such as: Input should be greater than 0
+    allowed = allowed.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
     return f"{name}={entry['input']!r} {allowed}."
 
 

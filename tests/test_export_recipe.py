@@ -128,7 +128,7 @@ def test_folders_that_hold_no_run_are_refused(tmp_path):
         ({"plant": "balloon"}, "is a run of plant 'balloon', the recipe is of 'wind_turbine'"),
         ({"policy": "mlp"}, "weights of 'model_based' .* do not fit"),
         ({"twinning": {"referee": {"colour": "red"}}}, "has no option twinning.referee.colour; it is of another"),
-        ({"episodes": "many"}, "episodes='many' should be a valid integer"),
+        ({"episodes": "many"}, "episodes='many' must be a valid integer"),
         ({"wind_files": ["gone.hh"]}, "cannot be carried out: .*gone.hh"),
     ):
         (folder / "config.json").write_text(json.dumps(settings | change))

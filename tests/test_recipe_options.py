@@ -96,7 +96,7 @@ def test_an_option_that_a_recipe_declares_anew_keeps_what_its_base_allows():
     assert Fewer().episodes == 6 and RunConfig().episodes == 20
     for options in ({"episodes": 0}, {"noise": -2.0}, {"hidden": (8, 0)}, {"episodes": 2.5}, {"twinning": None}):
         for read in (lambda given: Fewer(**given), lambda given: read_options(Fewer, given)):
-            with pytest.raises(ValueError, match="should be"):
+            with pytest.raises(ValueError, match="must be"):
                 read(options)
 
 
@@ -140,7 +140,7 @@ def pressed(config):
         (lambda config: importlib.import_module("not_installed.part"), SystemExit, "error: the package not_installed"),
         (without_a_package, SystemExit, "error: the package not_installed is not installed; .* --extra EXTRA"),
         (lambda config: Path("gone.bts").read_text(), SystemExit, "error: .*No such file or directory: 'gone.bts'"),
-        (lambda config: dataclasses.replace(config, seed=-1), SystemExit, "error: seed=-1 should be"),
+        (lambda config: dataclasses.replace(config, seed=-1), SystemExit, "error: seed=-1 must be"),
         (pressed, SystemExit, "130"),
         (lambda config: torch.ones(2).view(3, 3), RuntimeError, "."),
         (lambda config: rk4_step(None, None, None), TypeError, "."),
