@@ -203,30 +203,12 @@ def _sign(p: Program, a: int) -> int:
     return p.apply("sub", p.apply("gt", a, zero), p.apply("lt", a, zero))
 
 
-def _opposite(p: Program, remainder: int, b: int) -> int:
-    """Whether a remainder has another sign than its divisor."""
-    zero = p.constant(0.0)
-    opposite = p.logic("xor", p.apply("lt", remainder, zero), p.apply("lt", b, zero))
-    return p.logic("and", opposite, p.apply("ne", remainder, zero))
-
-
 def _remainder(p: Program, a: int, b: int) -> int:
     """What is left of a division, with the sign of the divisor; exact, however large the quotient is."""
-    remainder = p.apply("fmod", a, b)
-    return p.select(_opposite(p, remainder, b), p.apply("add", remainder, b), remainder)
-
-
-def _floor_divide(p: Program, a: int, b: int) -> int:
-    """The whole quotient of that remainder: 0.1 goes nine times into 1.0, although their rounded ratio is ten."""
-    remainder = p.apply("fmod", a, b)
-    whole = p.apply("div", p.apply("sub", a, remainder), b)
-    whole = p.select(_opposite(p, remainder, b), p.apply("sub", whole, p.constant(1.0)), whole)
-    return p.select(p.apply("eq", b, p.constant(0.0)), p.apply("div", a, b), p.apply("round", whole))
-
-
-def _number_of(how: str) -> Scalar:
-    """Minimum or maximum that prefers a number to NaN."""
-    return lambda p, a, b: p.select(p.logic("or", p.apply(how, a, b), p.apply("ne", b, b)), a, b)
+    remainder, zero = p.apply("fmod", a, b), p.constant(0.0)
+    opposite = p.logic("xor", p.apply("lt", remainder, zero), p.apply("lt", b, zero))
+    opposite = p.logic("and", opposite, p.apply("ne", remainder, zero))
+    return p.select(opposite, p.apply("add", remainder, b), remainder)
 
 
 def _to(name: str) -> Scalar:
@@ -253,10 +235,7 @@ OF_TWO: dict[str, Scalar] = {
     **{name: _to(name) for name in (*ARITHMETIC, *COMPARISONS, *EXTREMES)},
     **{name: _to(name) for name, count in FUNCTIONS.items() if count == 2},
     **{f"{how}_{name}": _logic(name) for how in ("logical", "bitwise") for name in ("and", "or", "xor")},
-    "fmin": _number_of("lt"),
-    "fmax": _number_of("gt"),
     "remainder": _remainder,
-    "floor_divide": _floor_divide,
     "tanh_backward": lambda p, g, y: p.apply("mul", g, p.apply("sub", p.constant(1.0), p.apply("mul", y, y))),
     "sigmoid_backward": lambda p, g, y: p.apply("mul", g, p.apply("mul", y, p.apply("sub", p.constant(1.0), y))),
 }

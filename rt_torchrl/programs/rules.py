@@ -237,20 +237,6 @@ def _copy_by(name: str) -> Rule:
     return rule
 
 
-def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.cells(args[1])
-
-
-def _diag_embed(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    places = torch.diag_embed(1 + tracer.cells(args[0]), *args[1:], **options)  # zero is no place of a diagonal
-    return torch.where(places > 0, places - 1, tracer.program.constant(0.0))
-
-
-def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
-    return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
-
-
 PLAIN = (
     "cat stack flip roll repeat expand_copy slice_scatter select_scatter diagonal_scatter unfold_copy view_copy "
     "permute_copy _unsafe_view alias_copy clone contiguous lift_fresh lift_fresh_copy"
@@ -271,22 +257,15 @@ RULES: dict[str, Rule] = {
     "linalg_inv_ex": _invert,
     "_linalg_check_errors": lambda tracer, args, options, out: [],
     **{name: _copy_by(name) for name in PLAIN},
-    **dict.fromkeys(("copy", "fill"), _overwrite),
-    "diag_embed": _diag_embed,
+    **dict.fromkeys(("copy", "fill"), lambda tracer, args, options, out: tracer.cells(args[1])),
     **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
-    "constant_pad_nd": _pad,
 }
 
 # Operators as torch code of simpler ones
 
 
-def _mean(x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-    total = x.sum(dim, keepdim)
-    return total / (x.numel() // max(1, total.numel()))
-
-
 def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None, *, keepdim: bool = False) -> Tensor:
-    deviation = x - _mean(x, dim, keepdim=True)
+    deviation = x - x.mean(dim, keepdim=True)
     total = (deviation * deviation).sum(dim, keepdim)
     return total / max(0.0, x.numel() / max(1, total.numel()) - (1.0 if correction is None else correction))
 
@@ -306,11 +285,6 @@ def _scatter(x: Tensor, dim: int, index: Tensor, source: Any, *, added: bool = F
     if isinstance(source, Tensor):
         source = source[tuple(map(slice, index.shape))]
     return x.index_put(_along(dim, index), torch.as_tensor(source, dtype=x.dtype), accumulate=added)
-
-
-def _backward_by(name: str) -> Callable[..., Tensor]:
-    """The gradient by what a view was taken of, of the view's sizes and place."""
-    return lambda x, sizes, *place: getattr(x.new_zeros(sizes), f"{name}_scatter")(x, *place)
 
 
 def _bucketize(x: Any, knots: Tensor, *, out_int32: bool = False, right: bool = False) -> Tensor:
@@ -336,10 +310,8 @@ def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Ca
 
 
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
-    "mean": _mean,
     "var": _variance,
     "gather": _gather,
-    "index_select": lambda x, dim, index: x.movedim(dim, 0)[index].movedim(0, dim),
     "scatter": _scatter,
     "scatter_add": partial(_scatter, added=True),
     "bucketize": _bucketize,
@@ -348,20 +320,15 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "cumprod": _cumulative(torch.mul),
     "max": _extreme(torch.amax, torch.maximum),
     "min": _extreme(torch.amin, torch.minimum),
-    "clamp_max": lambda x, limit: torch.clamp(x, max=limit),
-    "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
-    "deg2rad": lambda x: x * (math.pi / 180.0),
-    "rsub": lambda a, b, alpha=1: -(alpha * a) + b,
     "bmm": lambda a, b: torch.stack([x @ y for x, y in zip(a, b, strict=True)]),
-    **{f"{name}_backward": _backward_by(name) for name in ("slice", "select", "diagonal")},
 }
-"""Operators that are common enough to do without the tables of torch."""
+"""Operators in another way than torch's own."""
 
 
 @cache
 def decompositions_of_torch() -> dict[Any, Callable[..., Any]]:
     """The ways in which torch computes operators by simpler ones."""
-    # These tables take a third of a second to import, and most code needs none of them.
+    # These tables take some tenths of a second, and some code needs none of them.
     from torch._decomp import core_aten_decompositions, decomposition_table
 
     return {**decomposition_table, **core_aten_decompositions()}

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from traceback import walk_stack, walk_tb
-from types import CodeType, FrameType, ModuleType
+from types import FrameType, ModuleType
 from typing import Any
 
 import jaxtyping
@@ -55,40 +55,27 @@ class Places:
 
     def __init__(self) -> None:
         self._internal = (*map(_folder, (torch, sys.modules[__package__], jaxtyping)), *GENERATED)
-        self._lines: dict[int, tuple[CodeType, int]] = {}
+        self._lines: dict[int, str] = {}
 
     def note(self) -> None:
         """Note the line of an operator of a forward pass."""
-        if not torch.is_grad_enabled():
-            return
-        number, place = torch._C._autograd._get_sequence_nr() - 1, self._innermost()
-        if place is not None and number not in self._lines:  # operators without a gradient draw no number
-            self._lines[number] = place
+        if torch.is_grad_enabled():  # operators without a gradient draw no number
+            self._lines.setdefault(torch._C._autograd._get_sequence_nr() - 1, self.of(walk_stack(sys._getframe(1))))
 
     def now(self) -> str:
         """The line of the operator that is executed now, as the end of a message."""
         node = torch._C._current_autograd_node()
-        place = self._lines.get(node._sequence_nr()) if node is not None else None
-        return _in_words(place or self._innermost())
+        line = self._lines.get(node._sequence_nr()) if node is not None else None
+        return line or self.of(walk_stack(sys._getframe(1)))
 
     def of(self, frames: Iterable[tuple[FrameType, int]]) -> str:
-        """The last line of the caller's code among frames, as the end of a message."""
-        return _in_words(([None, *self._outside(frames)])[-1])
-
-    def _innermost(self) -> tuple[CodeType, int] | None:
-        """The innermost line outside of torch, this room and the checks of annotations."""
-        return next(self._outside(walk_stack(sys._getframe(1))), None)
-
-    def _outside(self, frames: Iterable[tuple[FrameType, int]]) -> Iterator[tuple[CodeType, int]]:
-        return ((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._internal))
-
-
-def _in_words(place: tuple[CodeType, int] | None) -> str:
-    if place is None:
+        """The first line of the caller's code among frames, as the end of a message."""
+        for frame, line in frames:
+            code = frame.f_code
+            if not code.co_filename.startswith(self._internal):
+                text = linecache.getline(code.co_filename, line).strip()
+                return f" (in {code.co_name}, {code.co_filename}:{line}: {text})"
         return ""
-    code, line = place
-    text = linecache.getline(code.co_filename, line).strip()
-    return f" (in {code.co_name}, {code.co_filename}:{line}: {text})"
 
 
 class Tracer(TorchDispatchMode):
@@ -199,7 +186,7 @@ class Tracer(TorchDispatchMode):
         except UntraceableError:
             raise
         except Exception as error:  # code may raise anything, such as for one realisation alone
-            place = self.places.of(walk_tb(error.__traceback__))
+            place = self.places.of(reversed([*walk_tb(error.__traceback__)]))
             text = f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}{place}"
             raise UntraceableError(text) from error
 
@@ -227,17 +214,24 @@ class Tracer(TorchDispatchMode):
                 if any(o.dtype != args[0].dtype for o in tensors_in([out])):
                     raise self.refuse(f"{func} reads numbers as another type", OTHERS)
                 return out
-            if not func._schema.is_mutable and self._foldable(args):
-                return self._folded(func, args, kwargs)
+            if not func._schema.is_mutable and self._foldable(args):  # into known numbers, whatever the operator is
+                out = func(*args, **kwargs)
+                for x in tensors_in([out]):
+                    self.assign(x, self._constants(x.detach()))
+                return out
             in_place = func._schema.is_mutable and packet.endswith("_")
-            if name in self._decompositions and in_place >= func._schema.is_mutable:
-                with self:
-                    result = self._translated(func, self._decompositions[name], *args, **kwargs)
-                    return args[0].copy_(result) if in_place else result
-            if not has_rule and not in_place and (decomposition := self._of_torch().get(func)):
-                with self:
-                    return decomposition(*args, **kwargs)
-            return self._executed(func, name, args, kwargs)
+            simpler = self._simpler(func, name)
+            if simpler is None:
+                return self._executed(func, name, args, kwargs)
+            with self:
+                result = self._translated(func, simpler, *args, **kwargs)
+                return args[0].copy_(result) if in_place else result
+
+    def _simpler(self, func: Any, name: str) -> Callable[..., Any] | None:
+        """An operator without a rule as torch code of simpler ones, which may also write in place."""
+        if name in self._rules or name in self._decompositions:
+            return self._decompositions.get(name)
+        return self._of_torch().get(getattr(getattr(torch.ops.aten, name, None), func._overloadname, None))
 
     def _foldable(self, args: tuple[Any, ...]) -> bool:
         """Whether all tensors among arguments hold known numbers, which are those of torch."""
@@ -245,13 +239,6 @@ class Tracer(TorchDispatchMode):
         return all(
             (exact or not x.is_floating_point()) and self.numbers(self.cells(x)) is not None for x in tensors_in(args)
         )
-
-    def _folded(self, func: Any, args: Arguments, kwargs: Options) -> Any:
-        """What an operator makes of known numbers: known numbers, whatever the operator is."""
-        out = func(*args, **kwargs)
-        for x in tensors_in([out]):
-            self.assign(x, self._constants(x.detach()))
-        return out
 
     def require_known(self, what: str, args: Iterable[Any]) -> None:
         """Refuse tensors whose numbers are not known when the program is made."""
@@ -290,15 +277,13 @@ class Tracer(TorchDispatchMode):
             raise self.refuse(what, OTHERS) from error
 
     def _elementwise(self, args: Arguments, kwargs: Options, out: Tensor, name: str) -> Tensor:
-        unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
+        unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "dtype"))]
         if unknown or (name.startswith("bitwise") and out.dtype != torch.bool):
             raise self.refuse(f"{name} of {out.dtype} with {unknown or 'bits'}", OTHERS)
         operands = [self.cells(a) for a in args[: ARITY[name]]]
         if (alpha := kwargs.get("alpha", 1)) != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)
-        rounding = kwargs.get("rounding_mode")
-        cells = self.pointwise("floor_divide" if rounding == "floor" else name, operands, out.shape)
-        return self.pointwise("trunc", [cells], out.shape) if rounding == "trunc" else cells
+        return self.pointwise(name, operands, out.shape)
 
     def pointwise(self, name: str, operands: list[Tensor], shape: Iterable[int]) -> Tensor:
         """The cells of an elementwise operator on cells: straight-line code, or one loop over a long row."""
