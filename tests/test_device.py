@@ -17,7 +17,6 @@ from torch.utils.backend_registration import _DummyBackendModule, _setup_private
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_folder import load_tensors, save_tensors
 from rt_torchrl.steps.config import AssimilationConfig, PlannerConfig
-from rt_torchrl.trajectories.engines import parallel
 
 
 class _Backend(_DummyBackendModule):
@@ -246,16 +245,6 @@ def test_the_device_refuses_what_a_gpu_refuses():
         # What a GPU takes: numbers, numbers in tensors, places and copies.
         assert (here * torch.tensor(2.0)).sum().item() == 6.0
         assert here[torch.tensor([0])].device == here.copy_(torch.ones(3)).device == device
-
-
-def test_the_engine_parallel_takes_larger_pieces(monkeypatch):
-    monkeypatch.setattr(parallel, "LARGE_PIECE", 6)
-    monkeypatch.setattr(parallel, "PIECE", 4)
-    with pretend_device() as device:
-        for here, rows in ((device, [6, 4]), (torch.device("cpu"), [4, 4, 2])):
-            starts = torch.zeros(2, 5, 1, device=here)
-            pieces = parallel._pieces(1, starts, parallel.Drive(starts[..., 0], starts, starts))
-            assert [len(states) for states, *_ in pieces] == rows
 
 
 def test_files_are_read_without_the_device(tmp_path):

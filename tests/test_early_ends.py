@@ -28,10 +28,7 @@ from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.trajectories.trajectory import (
-    batch_of,
-    continued,
-)
+from rt_torchrl.trajectories.trajectory import batch_of, continued
 
 
 class Falling(LinearQuadratic):

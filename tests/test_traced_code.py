@@ -89,17 +89,6 @@ def test_wide_perceptrons_need_no_wide_stack():
         assert gap(found, exact) < 1e-12
 
 
-def test_refusals_hold_no_tensors():
-    """The traceback of a refusal would keep everything that was traced."""
-    (case, _), (state, drive) = REFUSED["sort"], signals(2, 2)
-    with pytest.warns(UserWarning, match="sort"):
-        assert code.code_of(case, state, drive) is None
-    assert code.code_of(case, state, drive) is None  # without another warning
-    entries = (entry for entry, _ in code._codes.values())
-    (refusal,) = (entry for entry in entries if isinstance(entry, UntraceableError) and "sort" in str(entry))
-    assert refusal.__traceback__ is None
-
-
 @pytest.mark.parametrize("where", ["state", "weight"])
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.filterwarnings("error")

@@ -6,7 +6,7 @@ Whatever else code reads becomes a constant of it:
 - what a module holds, in attributes and in the lists, dictionaries, objects and tensors there: :class:`Holdings` has it
   by value, so that a change gives other code;
 - constants elsewhere, such as numbers, texts, tuples of these, functions and classes, which can only be replaced:
-  :class:`Outside` notices that;
+  :func:`outside_of` notices that;
 - what may change in its place elsewhere, such as a dictionary at the top of a module: it is refused by its name.
 """
 
@@ -17,7 +17,6 @@ import contextvars
 import dataclasses
 import dis
 import enum
-import functools
 import gc
 import hashlib
 import inspect
@@ -27,10 +26,10 @@ import random
 import sys
 import threading
 import types
-from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
-from functools import lru_cache
-from itertools import chain, starmap
+from functools import lru_cache, partial
+from itertools import chain
 from operator import getitem, is_, methodcaller
 from typing import Any, NamedTuple
 
@@ -59,14 +58,14 @@ REPLACED = (type, enum.Enum, types.ModuleType, types.FunctionType, staticmethod,
 """Types of objects that hold nothing, or what is judged by itself."""
 WRAPPERS = (
     *(types.FunctionType, types.MethodType, staticmethod, classmethod, property),
-    *(functools.partial, type(lru_cache(max))),
+    *(partial, type(lru_cache(max))),
 )
 """Types of functions and of what holds one."""
 MAPPINGS, SEQUENCES = (dict, types.MappingProxyType), (list, set, collections.deque, bytearray, array.array)
 PARTS = {
     types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"),
     types.MethodType: ("__func__", "__self__"),
-    functools.partial: ("func", "args", "keywords"),
+    partial: ("func", "args", "keywords"),
     types.CellType: ("cell_contents",),
 }
 """Attributes that hold what an object is made of."""
@@ -100,11 +99,13 @@ class Compared:
 
     def __init__(self) -> None:
         self.mappings, self.sequences, self.instances = list[Any](), list[Any](), list[Any]()
-        self.entries, self.parts = list[tuple[Mapping[str, Any], str]](), list[tuple[Any, str]]()
+        self.readers = list[Callable[[], object]]()
+        """Functions that give an object, such as an attribute."""
         self.classes = list[Mapping[str, Any]]()
         """Attributes of classes, of which none may come or go."""
         self.tensors, self.constants = list[Tensor](), list[Any]()
         """Tensors in their memory, and tensors and arrays with their numbers."""
+        self.note()
 
     def note(self) -> None:
         """Let everything be as it is now."""
@@ -115,8 +116,7 @@ class Compared:
         """All objects; as long as a list of them lives, no other object takes their addresses."""
         containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
         kinds, dicts = map(type, self.instances), map(vars, self.instances)
-        others = chain(kinds, dicts, starmap(getitem, self.entries), starmap(getattr, self.parts))
-        return chain(chain.from_iterable(containers), others)
+        return chain(chain.from_iterable(containers), kinds, dicts, map(methodcaller("__call__"), self.readers))
 
     def _numbers(self) -> list[object]:
         sizes = map(len, chain(self.mappings, self.sequences, self.classes))
@@ -195,7 +195,7 @@ class Holdings(Compared):
         for name in _parts_of(x):
             try:
                 contents.append(getattr(x, name))
-                self.parts.append((x, name))
+                self.readers.append(partial(getattr, x, name))
             except (AttributeError, ValueError):  # a slot or a variable without a value, which may get one
                 self._complete = False
         if hasattr(x, "__dict__"):
@@ -245,26 +245,6 @@ def _bytes(x: Any) -> bytes:
     return repr((x.shape, x.dtype)).encode() + x.tobytes()
 
 
-class Outside(Compared):
-    """Constants outside of a module, which can only be replaced, and classes with their methods."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._kinds = set[type]()
-        self.note()
-
-    def add_class(self, kind: type) -> bool:
-        """Let the bases and methods of a class stay the same; whether the class is a new one."""
-        new = kind not in self._kinds
-        if new:
-            self._kinds.add(kind)
-            attributes = vars(kind)
-            self.classes.append(attributes)
-            self.entries += [(attributes, name) for name, value in attributes.items() if isinstance(value, WRAPPERS)]
-            self.parts.append((kind, "__mro__"))
-        return new
-
-
 class Executed:
     """The functions of a user that are executed within :meth:`noted`."""
 
@@ -302,8 +282,8 @@ def _of_library(code: types.CodeType, namespace: dict[str, Any]) -> bool:
     return foreign(name) or generated
 
 
-def outside_of(root: nn.Module, holdings: Holdings, executed: Executed) -> Outside:
-    """The constants that executed functions of a module read outside of it.
+def outside_of(root: nn.Module, holdings: Holdings, executed: Executed) -> Compared:
+    """The constants that executed functions of a module read outside of it, and the methods of its classes.
 
     Raises:
         UntraceableError: if a function reads what may change without notice; the message names both.
@@ -315,13 +295,14 @@ class _Reads:
     """What executed functions read outside of a module, whose objects are given."""
 
     def __init__(self, objects: Iterable[object], executed: Executed):
-        self.outside, self._held = Outside(), {*map(id, objects)}  # whose changes the holdings notice
+        self.outside, self._kinds = Compared(), set[type]()
+        self._held = {*map(id, objects)}  # whose changes the holdings notice
         self._functions: dict[types.CodeType, list[types.FunctionType]] = collections.defaultdict(list)
         self._codes, self._judged = {code for code, _ in executed.globals}, set[tuple[int, str]]()
         for x in objects:
             self._note_function(x)
             for kind in (x if isinstance(x, type) else type(x)).__mro__:
-                if not foreign(kind.__module__) and self.outside.add_class(kind):
+                if not foreign(kind.__module__) and self._is_new(kind):
                     for value in vars(kind).values():
                         self._note_function(value)
         for (code, _), namespace in executed.globals.items():
@@ -332,6 +313,17 @@ class _Reads:
         for code in self._codes:
             self._variables(code, executed.variables.get(code, {}))
         self.outside.note()
+
+    def _is_new(self, kind: type) -> bool:
+        """Whether a class is a new one, whose bases and methods are to stay the same from now on."""
+        if kind in self._kinds:
+            return False
+        self._kinds.add(kind)
+        attributes, outside = vars(kind), self.outside
+        outside.classes.append(attributes)
+        methods = (name for name, value in attributes.items() if isinstance(value, WRAPPERS))
+        outside.readers += [partial(getattr, kind, "__mro__"), *(partial(getitem, attributes, x) for x in methods)]
+        return True
 
     def _globals(self, code: types.CodeType, namespace: dict[str, Any]) -> None:
         names = _names(code)
@@ -360,8 +352,8 @@ class _Reads:
             self._judged.add((id(holder), name))
             self._note_function(value)
             if isinstance(holder, type):
-                self.outside.add_class(holder)
-            self.outside.entries.append((namespace, name))
+                self._is_new(holder)
+            self.outside.readers.append(partial(getitem, namespace, name))
             self.outside.constants += [value] if followed else []
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
@@ -391,7 +383,7 @@ class _Reads:
             if not functions or not self._constant(variables[name]):
                 raise _refusal(code, f"the variable {name} of the function around it", variables[name])
             cells = ((f.__closure__ or ())[code.co_freevars.index(name)] for f in functions)
-            self.outside.parts += [(cell, "cell_contents") for cell in cells]
+            self.outside.readers += [partial(getattr, cell, "cell_contents") for cell in cells]
 
     def _note_function(self, x: object) -> None:
         """Note a function, those that it wraps, and those in variables around it."""
@@ -415,7 +407,7 @@ class _Reads:
             return all(map(self._constant, (*value, *getattr(value, "__dict__", {}).values())))
         if isinstance(value, types.MethodType):
             return self._constant(value.__self__)
-        if isinstance(value, functools.partial):
+        if isinstance(value, partial):
             return all(map(self._constant, (value.func, *value.args, *value.keywords.values())))
         if isinstance(value, CHANGING):
             return False

@@ -151,30 +151,24 @@ class Rollout:
     ) -> Drive:
         """The drive, after a check of everything."""
         plant, batch, n = self.plant, initial_state.shape[0], exogenous.shape[1] if exogenous.ndim == 3 else -1
-        expected = {
+        if (command is None) == (self.interval.policy is None) or (command is not None and deviation is not None):
+            raise ValueError(
+                f"plant {plant.name!r} is rolled out with commands, or with a policy and what deviates from its commands: "
+                "without a policy pass command and no deviation, with one pass no command."
+            )
+        given = {
             "initial_state": (initial_state, (batch, len(plant.states))),
             "exogenous": (exogenous, (batch, n, len(plant.inputs))),
+            "command": (command, (batch, n, len(plant.actions))),
+            "deviation": (deviation, (batch, n, len(plant.actions))),
         }
-        if (command is None) == (self.interval.policy is None):
-            raise ValueError(
-                f"plant {plant.name!r} is rolled out "
-                + ("without a policy: pass command." if command is None else "with a policy: pass no command.")
-            )
-        if deviation is not None and self.interval.policy is None:
-            raise ValueError(
-                f"deviation of plant {plant.name!r} is added to the commands of a policy, and there is none: pass it "
-                "in command."
-            )
-        for argument, actions in (("command", command), ("deviation", deviation)):
-            if actions is not None:
-                expected[argument] = (actions, (batch, n, len(plant.actions)))
-        for argument, (value, shape) in expected.items():
-            if tuple(value.shape) != shape or value.dtype != torch.float64:
+        for argument, (value, shape) in given.items():
+            if value is not None and (tuple(value.shape) != shape or value.dtype != torch.float64):
                 raise ValueError(
                     f"{argument} has shape {tuple(value.shape)} and dtype {value.dtype}; plant {plant.name!r} "
                     f"needs shape {shape} (batch, steps, signals) in torch.float64."
                 )
-            if not all_finite(value):
+            if value is not None and not all_finite(value):
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
         return drive_of(plant, exogenous, command if deviation is None else deviation, start=start)
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.programs.contract import Executed, Holdings, ImpureError, Outside, inputs_of, outside_of, require_pure
+from rt_torchrl.programs.contract import Compared, Executed, Holdings, ImpureError, inputs_of, outside_of, require_pure
 from rt_torchrl.programs.machine_code import Lanes, ObjectCode, lanes_of_this_machine, march_text, sweep_text
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.rules import new_tracer
@@ -187,7 +187,7 @@ class IntervalCode:
         self.point, self.lanes = point, lanes
         self.sweeps: dict[bool, ObjectCode] = {}
         """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
-        self.outside = Outside()
+        self.outside = Compared()
         """Constants outside of the interval that its code has read."""
         self._executed, holdings = Executed(), holdings or Holdings(interval)
         tracer = new_tracer(getattr(interval, "straight", STRAIGHT))
