@@ -73,7 +73,7 @@ class PlantContractError(ValueError):
 
 
 def check_plant(
-    plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True, trained: bool = True
+    plant: Plant, *, episodes: int = 4, steps: int = 50, traced: bool = True, trained: bool = True
 ) -> ContractReport:
     """Find all violations of the :class:`Plant` contract at once, not the first one alone.
 
@@ -88,7 +88,6 @@ def check_plant(
         plant: the plant, with the time step of its training; one on another device is checked by a copy on the CPU.
         episodes: number of flights, at least 2.
         steps: number of control intervals of each flight, at least 2 and at most that of an episode.
-        seed: seed of the draws and of the random commands.
         traced: whether the methods are also traced for the engine ``native``.
         trained: whether a twin of this plant trains its closure, so that each weight must matter on the flights; False
             for a real system whose twin is another plant.
@@ -109,23 +108,23 @@ def check_plant(
     if any(tensor.device.type != "cpu" for tensor in (*plant.parameters(), *plant.buffers())):
         plant = copy.deepcopy(plant).cpu()
     steps = min(steps, plant.n_steps)
-    violations = [*signals(plant)] or [*attempt(draws, plant, seed), *attempt(modules, plant, seed)]
-    violations = violations or _on_flights(plant, episodes, steps, seed, trained=trained)
+    violations = [*signals(plant)] or [*attempt(draws, plant), *attempt(modules, plant)]
+    violations = violations or _on_flights(plant, episodes, steps, trained=trained)
     if violations:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), violations)
-    calls = Calls.at_the_start(plant, episodes, seed)
+    calls = Calls.at_the_start(plant, episodes)
     reason = untraceable(calls) if traced else None
     return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, step_error(calls), reason)
 
 
-def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, *, trained: bool) -> list[str]:
+def _on_flights(plant: Plant, episodes: int, steps: int, *, trained: bool) -> list[str]:
     """The violations that need states to be found; an early violation ends the search."""
-    calls = Calls.at_the_start(plant, episodes, seed)
+    calls = Calls.at_the_start(plant, episodes)
     violations = [*attempt(methods, calls), *attempt(stability, calls)]
     if violations:
         return violations
     try:
-        calls = Calls.in_flight(plant, episodes, steps, seed)
+        calls = Calls.in_flight(plant, episodes, steps)
     except FloatingPointError as error:
         return [f"step: {error}"]
     if not trained:
@@ -166,9 +165,9 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
     """
     if not (isinstance(law, type) and issubclass(law, ClassicalController)):
         raise ValueError(f"{name}={law!r} must be a class derived from ClassicalController: give the class itself.")
-    controller, state = law(plant), plant.draw_initial_state(STATES, seeded(0))[:, : len(plant.readings)]
+    controller, state = law(plant), plant.draw_initial_state(STATES, seeded())[:, : len(plant.readings)]
     size, about, actions = controller.memory_size, f"{name}: {law.__name__}", len(plant.actions)
-    memory, exogenous = controller.first_memory(state), plant.draw_exogenous(STATES, seeded(0))[:, 0]
+    memory, exogenous = controller.first_memory(state), plant.draw_exogenous(STATES, seeded())[:, 0]
     _require(f"{about}.first_memory returns a memory", memory, size)
     try:
         command, memory = controller.law(state, memory, exogenous)

@@ -49,12 +49,12 @@ def _faults(group: str, signal: Signal, count: int) -> list[str]:
     return [text for text, wrong in faults.items() if wrong]
 
 
-def seeded(seed: int) -> torch.Generator:
+def seeded(seed: int = 0) -> torch.Generator:
     """A new generator with the seed."""
     return torch.Generator().manual_seed(seed)
 
 
-def draws(plant: Plant, seed: int) -> Iterator[str]:
+def draws(plant: Plant) -> Iterator[str]:
     """Violations in shape, precision, range and source of the initial states and of the inputs."""
     expected = {
         "draw_initial_state": ((BATCH, len(plant.states)), plant.states),
@@ -62,12 +62,12 @@ def draws(plant: Plant, seed: int) -> Iterator[str]:
     }
     for name, (shape, group) in expected.items():
         draw = partial(getattr(plant, name), BATCH)
-        drawn = draw(seeded(seed))
+        drawn = draw(seeded())
         if problem := misshapen(drawn, shape):
             yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}."
         else:
             yield from _out_of_range(name, drawn, group)
-            yield from _other_sources(name, draw, seed)
+            yield from _other_sources(name, draw)
 
 
 def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
@@ -94,15 +94,15 @@ def _out_of_range(name: str, drawn: Tensor, group: tuple[Signal, ...]) -> Iterat
             )
 
 
-def _other_sources(name: str, draw: Callable[[torch.Generator], Tensor], seed: int) -> Iterator[str]:
+def _other_sources(name: str, draw: Callable[[torch.Generator], Tensor]) -> Iterator[str]:
     """A violation if a draw depends on more than its generator, or not on it; all episodes may be the same.
 
     It may draw torch's global random numbers, as layers do before their weights are overwritten, but may not use them.
     """
     with torch.random.fork_rng(devices=()):
-        first = draw(seeded(seed))
+        first = draw(seeded())
         torch.manual_seed(1 + torch.initial_seed())
-        again, other = draw(seeded(seed)), draw(seeded(seed + 1))
+        again, other = draw(seeded()), draw(seeded(1))
     remedy = "take every random number from the generator that is passed in, and change nothing of the plant."
     if not torch.equal(first, again):
         yield f"{name}: gives something else each time for generators of the same seed; {remedy}"
@@ -110,7 +110,7 @@ def _other_sources(name: str, draw: Callable[[torch.Generator], Tensor], seed: i
         yield f"{name}: draws different episodes, but the same ones for generators of another seed; {remedy}"
 
 
-def modules(plant: Plant, seed: int) -> Iterator[str]:
+def modules(plant: Plant) -> Iterator[str]:
     """Violations in precision and source of the weights of closures and policy, and in the policy's commands."""
     neural = neural_closure_of(plant)
     makers: dict[str, Callable[[torch.Generator], nn.Module]]
@@ -118,20 +118,20 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
     makers |= {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
     makers |= {} if neural is None else {"make_neural_closure": neural}
     for name, make in makers.items():
-        module = make(seeded(seed))
+        module = make(seeded())
         if not isinstance(module, nn.Module):
             yield f"{name}: is a {type(module).__name__}; expected a torch.nn.Module."
             continue
         for weight, value in module.named_parameters():
             if value.dtype != torch.float64:
                 yield f"{name}: has {weight} in {value.dtype}; expected torch.float64: call .double()."
-        yield from _other_sources(name, partial(_drawn_weights, make), seed)
+        yield from _other_sources(name, partial(_drawn_weights, make))
         if name != "closure" and not any(weight.requires_grad for weight in module.parameters()):
             yield f"{name}: has no trainable weights; what is learned must be an nn.Parameter with requires_grad."
     # Observations are of order one, as they should be scaled.
     shape = (50, len(plant.actions))
-    observations = 3.0 * torch.rand(50, len(plant.observations), generator=seeded(seed), dtype=torch.float64) - 1.5
-    command = plant.make_policy(seeded(seed))(observations)
+    observations = 3.0 * torch.rand(50, len(plant.observations), generator=seeded(), dtype=torch.float64) - 1.5
+    command = plant.make_policy(seeded())(observations)
     if problem := misshapen(command, shape):
         yield f"make_policy: its commands on 50 observations have {problem}."
     else:

@@ -116,7 +116,7 @@ def gradients(calls: Calls) -> Iterator[str]:
     for name in ("vector_field", "step"):
         yield from _by_weights(calls, latest[name], arguments, calls.closure, "closure")
     if "observe" not in reported:
-        policy = calls.plant.make_policy(seeded(calls.seed))
+        policy = calls.plant.make_policy(seeded())
         command = calls.commanded_by(policy)
         yield from _by_argument(calls, command, arguments, "state")
         yield from _by_weights(calls, command, arguments, policy, "policy")
@@ -125,7 +125,7 @@ def gradients(calls: Calls) -> Iterator[str]:
 def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: str) -> Iterator[str]:
     """Wrong derivatives along each signal of an argument, at each time and episode."""
     value = arguments[argument].clone()
-    measure = _measure(method, {**arguments, argument: value}, calls.seed)
+    measure = _measure(method, {**arguments, argument: value})
     (gradient,) = _gradients(measure, [value.requires_grad_()])
     for k, signal in enumerate(getattr(calls.plant, SIGNALS[argument])):
         direction = torch.zeros_like(value)
@@ -137,7 +137,7 @@ def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: s
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
     """Wrong derivatives along one random direction for each tensor of weights."""
-    measure, generator, dormant = _measure(method, arguments, calls.seed), seeded(calls.seed), _dormant(module)
+    measure, generator, dormant = _measure(method, arguments), seeded(), _dormant(module)
     weights = {name: w for name, w in module.named_parameters() if w.requires_grad}
     for (name, weight), gradient in zip(weights.items(), _gradients(measure, [*weights.values()]), strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
@@ -179,11 +179,11 @@ def _differences(x: Tensor, direction: Tensor, measure: Callable[[], Tensor], sl
     return torch.where(corner, slope.clamp(low, high), sides.mean(0))
 
 
-def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[], Tensor]:
+def _measure(method: Method, arguments: Arguments) -> Callable[[], Tensor]:
     """A random combination of a method's outputs, in units of their size, for each time and episode."""
     with torch.no_grad():
         outputs = method.outputs(arguments)
-    generator, weights = seeded(seed), []
+    generator, weights = seeded(), []
     for trailing, value in zip(method.gives.values(), outputs, strict=True):
         share = torch.randn(trailing, generator=generator, dtype=torch.float64)
         weights.append(share / (1e-3 + value.abs().amax((0, 1))))
@@ -242,7 +242,7 @@ def untraceable(calls: Calls) -> str | None:
     Whatever the code raises for one realisation keeps it from the plant.
     """
     plant, arguments, lanes = calls.plant, calls.arguments, lanes_of_this_machine()
-    policy = plant.make_policy(seeded(calls.seed))
+    policy = plant.make_policy(seeded())
     initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"][..., :0])
     point = point_of(initial_state, drive, lanes.number)

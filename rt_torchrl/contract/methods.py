@@ -42,40 +42,39 @@ class Calls:
         plant: the plant.
         arguments: tensors by name: ``t`` of shape ``n 1``; ``state``, ``command``, ``applied``, ``exogenous`` and
             ``measured`` (states of another episode) of shape ``n batch`` and their number of signals.
-        seed: seed of the twin's closure.
     """
 
-    def __init__(self, plant: Plant, arguments: Arguments, seed: int):
-        self.plant, self.arguments, self.seed = plant, arguments, seed
-        self.closure: nn.Module = plant.make_closure(seeded(seed))
+    def __init__(self, plant: Plant, arguments: Arguments):
+        self.plant, self.arguments = plant, arguments
+        self.closure: nn.Module = plant.make_closure(seeded())
 
     @classmethod
-    def at_the_start(cls, plant: Plant, episodes: int, seed: int) -> "Calls":
+    def at_the_start(cls, plant: Plant, episodes: int) -> "Calls":
         """Arguments in the first interval of two groups of episodes; they need only the draws of the plant."""
-        generator = seeded(seed)
+        generator = seeded()
         state = plant.draw_initial_state(2 * episodes, generator)
         exogenous = plant.draw_exogenous(2 * episodes, generator)[:, 0]
         command = random_commands(plant, (2 * episodes,), generator)
         state, command, exogenous = (x.reshape(2, episodes, -1) for x in (state, command, exogenous))
         t = torch.zeros(2, 1, dtype=torch.float64)
-        return cls(plant, _named(t, state, command, exogenous, applied=command), seed)
+        return cls(plant, _named(t, state, command, exogenous, applied=command))
 
     @classmethod
     @torch.no_grad()
-    def in_flight(cls, plant: Plant, episodes: int, steps: int, seed: int) -> "Calls":
+    def in_flight(cls, plant: Plant, episodes: int, steps: int) -> "Calls":
         """Arguments in all intervals of flights of the true plant under random commands.
 
         Raises:
             DivergenceError: if a flight leaves the finite numbers.
         """
-        generator = seeded(seed)
+        generator = seeded()
         state = plant.draw_initial_state(episodes, generator)
         exogenous = plant.draw_exogenous(episodes, generator)[:, :steps]
         command = random_commands(plant, (episodes, steps), generator)
         flown = Rollout(plant, plant.closure, engine="autograd")(state, exogenous, command)
         t = plant.dt * torch.arange(steps, dtype=torch.float64).unsqueeze(-1)
         rows = [x.transpose(0, 1).contiguous() for x in (flown.states[:, :-1], command, exogenous, flown.actions)]
-        return cls(plant, _named(t, *rows), seed)
+        return cls(plant, _named(t, *rows))
 
     def methods(self) -> list[Method]:
         """Every method; a method that takes a closure comes with the true closure and with that of the twin."""
@@ -137,8 +136,8 @@ def _under(method: Callable[..., Any], closure: nn.Module) -> Callable[..., Any]
 def module_methods(calls: Calls) -> list[Method]:
     """The command of the plant's policy and the rates under its neural closure, by what makes them."""
     neural = neural_closure_of(calls.plant)
-    closures = [] if neural is None else [calls.field_under(neural(seeded(calls.seed)), "make_neural_closure")]
-    return [calls.commanded_by(calls.plant.make_policy(seeded(calls.seed))), *closures]
+    closures = [] if neural is None else [calls.field_under(neural(seeded()), "make_neural_closure")]
+    return [calls.commanded_by(calls.plant.make_policy(seeded())), *closures]
 
 
 @torch.no_grad()

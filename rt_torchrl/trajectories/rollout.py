@@ -153,7 +153,7 @@ class Rollout:
         plant, batch, n = self.plant, initial_state.shape[0], exogenous.shape[1] if exogenous.ndim == 3 else -1
         if (command is None) == (self.interval.policy is None) or (command is not None and deviation is not None):
             raise ValueError(
-                f"plant {plant.name!r} is rolled out with commands, or with a policy and what deviates from its commands: "
+                f"plant {plant.name!r} is rolled out with commands, or with a policy and deviations from its commands: "
                 "without a policy pass command and no deviation, with one pass no command."
             )
         given = {

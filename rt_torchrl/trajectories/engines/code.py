@@ -83,13 +83,10 @@ class Group(NamedTuple):
         """Number of lanes with a realisation of their own."""
         return self.last - self.first
 
-    def gather(self, *arrays: np.ndarray) -> np.ndarray:
-        """Rows ``n batch signals`` of arrays, side by side as ``n signals lanes``."""
-        gathered, first = np.empty((len(arrays[0]), sum(x.shape[-1] for x in arrays), self.lanes)), 0
-        for x in arrays:
-            last = first + x.shape[-1]
-            gathered[:, first:last, : self.live] = x[:, self.first : self.last].transpose(0, 2, 1)
-            first = last
+    def gather(self, array: np.ndarray) -> np.ndarray:
+        """Rows ``n batch signals`` of an array, side by side as ``n signals lanes``."""
+        gathered = np.empty((len(array), array.shape[-1], self.lanes))
+        gathered[:, :, : self.live] = array[:, self.first : self.last].transpose(0, 2, 1)
         gathered[:, :, self.live :] = gathered[:, :, self.live - 1 : self.live]
         return gathered
 
