@@ -43,25 +43,6 @@ class Slotted:
     __init__ = Options.__init__
 
 
-class Refusing(Options):
-    """Cannot be pickled."""
-
-    def __reduce_ex__(self, protocol):
-        raise TypeError("no")
-
-    def __deepcopy__(self, memo):
-        copied = Refusing()
-        copied.scale = self.scale
-        return copied
-
-
-class Dropping(Options):
-    """Leaves everything out of its pickle."""
-
-    def __getstate__(self):
-        return {}
-
-
 @dataclasses.dataclass(frozen=True)
 class Frozen:
     scale: float = 0.1

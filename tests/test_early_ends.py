@@ -228,21 +228,6 @@ def test_few_weights_are_searched_on_where_gradients_do_not_see_an_end(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("hidden", "sizes"), [((3,), [6, 3, 3, 1]), ((16, 16), [16, 16, 1]), ((64,), [1]), ((39,), [39, 1])]
-)
-def test_of_many_weights_those_of_the_output_layer_are_searched(hidden, sizes, monkeypatch):
-    plant = Falling()
-    policy = rt.SaturatedMLP(2, plant.actions, hidden=hidden, generator=seeded())
-    planner = WholeEpisodes(rt.DigitalTwin(plant, plant.closure), policy, rt.PlannerConfig(iterations=2))
-    assert [weight.numel() for weight in planner.searched] == sizes
-    monkeypatch.setattr(planner.descent, "run", lambda cost, count: Descended(1.0, 1.0, 0.0, 0))
-    before = [weight.detach().clone() for weight in policy.parameters()]
-    planner.plan(rt.Scenario(*drawn(plant, 3)))
-    changed = [not torch.equal(*pair) for pair in zip(before, policy.parameters(), strict=True)]
-    assert changed == [False] * (len(before) - len(sizes)) + [True] * len(sizes)
-
-
-@pytest.mark.parametrize(
     ("kind", "method", "times"),
     [(Falling, "multi_start", 20), (Falling, "single_start", 1), (LinearQuadratic, "multi_start", 1)],
 )
