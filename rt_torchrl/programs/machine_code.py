@@ -385,15 +385,10 @@ def _compile(text: str) -> bytes:
 
 def _machine() -> llvm.TargetMachine:
     """A new description of this processor, because the code that is loaded with one frees it."""
-    target = _target()
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=OPTIMISATION, jit=True)
-
-
-@cache
-def _target() -> llvm.Target:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=OPTIMISATION, jit=True)
 
 
 @cache

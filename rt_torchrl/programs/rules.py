@@ -158,66 +158,6 @@ def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
     return in_shape(cells, target.shape)
 
 
-# Linear equations
-
-
-def _eliminate(tracer: Tracer, A: Tensor, B: Tensor) -> Tensor:
-    """The cells of X with A X = B of matrices in the last two dimensions, by elimination with partial pivoting."""
-    n = A.shape[-1]
-    if n > LARGEST_SOLVED:
-        raise tracer.refuse(f"linear equations of {n} unknowns, more than {LARGEST_SOLVED}", "eliminate some before")
-    lead = torch.broadcast_shapes(A.shape[:-2], B.shape[:-2])
-    pairs = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]).tolist() for x in (A, B))
-    solved = [_eliminated(tracer, [[*a, *b] for a, b in zip(*pair, strict=True)]) for pair in zip(*pairs, strict=True)]
-    return in_shape([x for rows in solved for row in rows for x in row], (*lead, n, B.shape[-1]))
-
-
-def _eliminated(tracer: Tracer, rows: list[list[int]]) -> list[list[int]]:
-    """X of rows (A, B)."""
-    p, n, width = tracer.program, len(rows), range(len(rows[0]))
-    for k in range(n):
-        for i in range(k + 1, n):  # of the two rows, the one with the greater pivot goes first
-            greater = p.apply("gt", p.apply("abs", rows[i][k]), p.apply("abs", rows[k][k]))
-            pairs = [(p.select(greater, b, a), p.select(greater, a, b)) for a, b in zip(rows[k], rows[i], strict=True)]
-            rows[k], rows[i] = ([*row] for row in zip(*pairs, strict=True))
-        for i in range(k + 1, n):
-            factor = p.apply("div", rows[i][k], rows[k][k])
-            rows[i] = [
-                p.apply("sub", rows[i][j], p.apply("mul", factor, rows[k][j])) if j > k else rows[i][j] for j in width
-            ]
-    solution: list[list[int]] = []
-    for k in reversed(range(n)):
-        totals = rows[k][n:]
-        for a, x in zip(rows[k][k + 1 : n], solution, strict=True):
-            totals = [p.apply("sub", total, p.apply("mul", a, y)) for total, y in zip(totals, x, strict=True)]
-        solution.insert(0, [p.apply("div", total, rows[k][k]) for total in totals])
-    return solution
-
-
-def _solve(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
-    """X of A X = B; in the place of the factors of A stands A itself, which :func:`_solve_again` takes."""
-    A, B = map(tracer.cells, args[:2])
-    vector = B.ndim == 1 or (B.ndim == A.ndim - 1 and B.shape == A.shape[:-1])
-    X = _solved(tracer, A, B.unsqueeze(-1) if vector else B, left=options.get("left", True))
-    nothing = [torch.full(x.shape, tracer.program.constant(0)) for x in out[2:]]
-    return [X.squeeze(-1) if vector else X, A, *nothing]
-
-
-def _solve_again(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    A, _, B = map(tracer.cells, args)
-    return _solved(tracer, A.mT if options.get("adjoint", False) else A, B, left=options.get("left", True))
-
-
-def _solved(tracer: Tracer, A: Tensor, B: Tensor, *, left: bool) -> Tensor:
-    return _eliminate(tracer, A, B) if left else _eliminate(tracer, A.mT, B.mT).mT
-
-
-def _invert(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
-    A, p = tracer.cells(args[0]), tracer.program
-    identity = torch.tensor([[p.constant(float(i == j)) for j in range(A.shape[-1])] for i in range(A.shape[-1])])
-    return [_eliminate(tracer, A, identity), torch.full(out[1].shape, p.constant(0))]
-
-
 # Copies, carried out on the cells
 
 
@@ -252,9 +192,6 @@ RULES: dict[str, Rule] = {
     "mm": lambda tracer, args, options, out: matrix_product(tracer, *map(tracer.cells, args)),
     "addmm": _addmm,
     "index": _index,
-    "_linalg_solve_ex": _solve,
-    "linalg_lu_solve": _solve_again,
-    "linalg_inv_ex": _invert,
     "_linalg_check_errors": lambda tracer, args, options, out: [],
     **{name: _copy_by(name) for name in PLAIN},
     **dict.fromkeys(("copy", "fill"), lambda tracer, args, options, out: tracer.cells(args[1])),
@@ -309,7 +246,45 @@ def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Ca
     return extreme
 
 
+def _solved(A: Tensor, B: Tensor, *, left: bool = True) -> Tensor:
+    """X of A X = B, or of X A = B, by elimination with partial pivoting."""
+    if not left:
+        return _solved(A.mT, B.mT).mT
+    n, lead = A.shape[-1], torch.broadcast_shapes(A.shape[:-2], B.shape[:-2])
+    if n > LARGEST_SOLVED:
+        raise ValueError(f"linear equations of {n} unknowns, more than {LARGEST_SOLVED}")
+    rows = [*torch.cat([x.expand(*lead, *x.shape[-2:]) for x in (A, B)], -1).unbind(-2)]
+    for k in range(n):
+        for i in range(k + 1, n):  # of the two rows, the one with the greater pivot goes first
+            greater = rows[i][..., k : k + 1].abs() > rows[k][..., k : k + 1].abs()
+            rows[k], rows[i] = torch.where(greater, rows[i], rows[k]), torch.where(greater, rows[k], rows[i])
+        for i in range(k + 1, n):
+            rows[i] = rows[i] - rows[i][..., k : k + 1] / rows[k][..., k : k + 1] * rows[k]
+    solution: list[Tensor] = []
+    for k in reversed(range(n)):
+        total = rows[k][..., n:]
+        for j, x in enumerate(solution, k + 1):
+            total = total - rows[k][..., j : j + 1] * x
+        solution.insert(0, total / rows[k][..., k : k + 1])
+    return torch.stack(solution, -2)
+
+
+def _solve(A: Tensor, B: Tensor, *, left: bool = True, check_errors: bool = False) -> tuple[Tensor, ...]:
+    """X, and in the place of the factors of A this matrix itself, which the gradient takes."""
+    vector = B.ndim == 1 or (B.ndim == A.ndim - 1 and B.shape == A.shape[:-1])
+    X = _solved(A, B.unsqueeze(-1) if vector else B, left=left)
+    nothing = torch.zeros(A.shape[:-1], dtype=torch.int32)
+    return X.squeeze(-1) if vector else X, A, nothing, nothing[..., 0]
+
+
+def _invert(A: Tensor, *, check_errors: bool = False) -> tuple[Tensor, ...]:
+    return _solved(A, torch.eye(A.shape[-1], dtype=A.dtype)), torch.zeros(A.shape[:-2], dtype=torch.int32)
+
+
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
+    "_linalg_solve_ex": _solve,
+    "linalg_lu_solve": lambda A, _, B, *, left=True, adjoint=False: _solved(A.mT if adjoint else A, B, left=left),
+    "linalg_inv_ex": _invert,
     "var": _variance,
     "gather": _gather,
     "scatter": _scatter,

@@ -331,13 +331,10 @@ class Tracer(TorchDispatchMode):
             if walk is not None:
                 return operations[0].operands[0], walk
         if numbers := self.numbers(cells):
-            return self.table(numbers), Access(0, torch.empty(cells.shape).stride())
+            table = p.new("table", attributes=tuple(x.hex() for x in numbers), kind="array")
+            return table, Access(0, torch.empty(cells.shape).stride())
         array = p.new("row", *map(p.as_number, flat), attributes=(tuple(cells.shape),), kind="array")
         return array, Access(0, torch.empty(cells.shape).stride())
-
-    def table(self, numbers: list[float]) -> int:
-        """An array of constants."""
-        return self.program.new("table", attributes=tuple(x.hex() for x in numbers), kind="array")
 
 
 class _Escapes(TorchFunctionMode):
