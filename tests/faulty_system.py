@@ -5,7 +5,14 @@ from dataclasses import dataclass
 
 import torch
 
+from rt_torchrl import Reading, RealSystem
 from rt_torchrl.systems.environment import AroundSystem
+
+
+def as_reported(env, plant, **options):
+    """A real system whose states, inputs and applied actions are reported under their names."""
+    places = {name: Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
+    return RealSystem(env, plant, **places | options)
 
 
 @dataclass(frozen=True)

@@ -274,7 +274,7 @@ def test_an_end_where_the_plant_has_none_is_refused():
     plant.reach = 100.0  # so that the plant goes on
     env = connected(plant, rig=Rig(plant, ends_after=12, terminates=True, seed=3))
     found = algorithm(env, plant)
-    with pytest.raises(ValueError, match=r"terminated the episode after 12 of 50 .* does not end there.*end_cost"):
+    with pytest.raises(ValueError, match=r"ended the episode after 12 of 50 .* does not end there.*end_cost"):
         found.episode()
 
 

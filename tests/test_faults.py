@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from faulty_system import FaultySystem, Injection
+from faulty_system import FaultySystem, Injection, as_reported
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from small_runs import SMALL
@@ -15,7 +15,6 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.systems.real_system import Reading, RealSystem
 from rt_torchrl.systems.sound_part import GREATEST
 
 DT, N = 0.1, 40
@@ -142,8 +141,7 @@ def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     plant = LinearQuadratic(horizon=DT * N)
     config = RunConfig(episodes=3, log_dir=tmp_path, unseen=2, figures=figures, twinning=SMALL)
     system = guarded(Injection("nan", 8, 10), Injection("raises", 30, episode=2), plant=plant)
-    states, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
-    run = Run(config, plant, env=RealSystem(system, plant, state=states, exogenous=exogenous, applied=applied))
+    run = Run(config, plant, env=as_reported(system, plant))
     episodes = run.train()["episodes"]
     assert "faults" not in episodes[0]
     assert [(fault["kind"], fault["interval"]) for fault in episodes[1]["faults"]] == [("not finite", 8)]

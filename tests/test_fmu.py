@@ -139,7 +139,7 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
         level += 0.5 * (0.1 - 0.1 * level)
         assert entries["outputs"].item() == pytest.approx(level, abs=1e-12)
         entries = entries.exclude("reward")
-    with pytest.raises(FMUError, match=r"the FMU Barrel.fmu refuses to doStep at t = 2.5 s"):
+    with pytest.raises(FMUError, match=r"the FMU Barrel.fmu refuses a call at t = 2.5 s: fmi2DoStep"):
         made.step(entries.set("action", torch.tensor([41000.0, 0.0]).double()))
     assert made.reset()["outputs"].tolist() == [1.0]
     made.close()

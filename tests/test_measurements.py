@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -95,13 +94,6 @@ def test_slopes_of_all_sensors_are_those_of_finite_differences(name, kind, which
         ahead, behind = (read(sensors, plant, t, state + sign * step, inputs) for sign in (1.0, -1.0))
         difference = (ahead - behind) / (2.0 * step[..., k, None])
         torch.testing.assert_close(slopes[..., k], difference, rtol=1e-4, atol=1e-5)
-
-
-def test_rates_by_filters_have_no_sensor_where_the_plant_has_no_filters():
-    assert "speed_rate" in known_sensors(WindTurbine(observe=("speed_rate",)))
-    assert "speed_rate" not in known_sensors(WindTurbine())
-    assert "filtered_rate_x" in known_sensors(FlappingWing(observe=("position",)))
-    assert "filtered_rate_x" not in known_sensors(FlappingWing())
 
 
 # Previews
@@ -234,10 +226,6 @@ def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unc
     state, exogenous = torch.tensor([[7.0, 5.0]]).double(), torch.tensor([[0.25]]).double()
     seen = plant.observe(torch.tensor([1.0]).double(), state, exogenous)
     torch.testing.assert_close(seen, torch.tensor([[2.0, 0.25, 0.0, 1.0]]).double(), rtol=0, atol=1e-15)
-
-
-def test_a_text_stands_for_a_path(unchecked):
-    assert rt.RunConfig(log_dir="runs/mine").log_dir == Path("runs/mine")
 
 
 # Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.

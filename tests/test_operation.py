@@ -5,24 +5,23 @@ import itertools
 import math
 import multiprocessing
 import os
+from functools import partial
 
 import pytest
 import test_algorithm
 import torch
-from faulty_system import FaultySystem, Injection
+from faulty_system import FaultySystem, Injection, as_reported
 from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from test_classical import PD
 from test_faults import require_true
 
 import rt_torchrl as rt
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.systems import operation as module
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from rt_torchrl.systems.operation import FIRST, Operation, Operator
-from rt_torchrl.systems.sound_part import EpisodeEndedError
 
 QUIET = rt.ExplorationConfig(episodes=0)
 NO_TIME = 1e9
@@ -43,13 +42,14 @@ class InProcess(Operation):
         self.operator.start()
 
     def _pass_on(self, order):
-        self.operator.follow(order)
+        self.operator.follow(order, order.ready(self.operator.policies))
 
     def waiting(self):
         return False
 
     def rollout(self):
-        return self._take(self.operator.window(self.receive).stacked(), self.operator.version)
+        window = self.operator.window(self.receive)
+        return self._take(window._replace(entries=module.together(window.entries)), self.version)
 
     def receive(self):
         """Nothing is ordered within a window."""
@@ -111,29 +111,11 @@ def test_the_action_fades_from_one_policy_to_the_next():
     assert window["version"].flatten().tolist() == [0] * 10 + [1] * 40
 
 
-def test_the_handover_keeps_the_actuators_own_rate(monkeypatch):
-    """Torque and pitch of the turbine move by 7500 N m and 4 deg in an interval of half a second."""
-    plant = WindTurbine(horizon=30.0)
-    monkeypatch.setattr(module, "HANDOVER", 1)
-    window = handed_over(plant, Constant(4e4, 20.0), Constant(1e4, 0.0), 5)
-    action, applied = window["action"], window["next", "applied"]
-    steps = action.diff(dim=0).abs().max(0).values
-    assert steps[0] <= 7500.0 + 1e-6 and steps[1] <= 4.0 + 1e-9
-    # Nothing is lost in the actuators, so that what the learner reads is what the policies wanted.
-    torch.testing.assert_close(applied[20:], action[20:])
-
-
 # Operation while learning, together with limits and faults.
 
 
 LIMITS = OperatingLimitsConfig(states={"velocity": (-9.0, 9.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 20.0})
 PLANT = LinearQuadratic(horizon=3.0)
-
-
-def as_reported(env, plant, **options):
-    """A real system whose states, inputs and applied actions are reported under their names."""
-    places = {name: rt.Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
-    return rt.RealSystem(env, plant, **places, **options)
 
 
 def machine(injections=(), fallback=(0.0,), **options):
@@ -196,28 +178,6 @@ def test_a_reading_refused_at_the_end_of_a_window_is_not_the_start_of_the_next()
     assert stored == [30, 59, 88]
 
 
-class Clock(torch.nn.Module):
-    """State feedback that keeps the times at which it acted, and has nothing to report before."""
-
-    begin = fly = lambda self: None
-    times = ()
-
-    def act(self, t, state, exogenous):
-        self.times = (*self.times, round(t / PLANT.dt))
-        return torch.zeros(1, 1).double()
-
-    def report(self):
-        return {"last": float(self.times[-1])}
-
-
-def test_a_fallback_has_the_clock_of_the_window():
-    fallback = Clock()
-    found = operated(machine(fallback=fallback), continuous=True)
-    for _ in range(2):
-        found.episode()
-    assert fallback.times == (*range(30), *range(30))
-
-
 def unreachable(fails):
     """A system that fails in one of its resets, which are counted from 1."""
     system, resets = Stepped(PLANT), itertools.count(1)
@@ -246,24 +206,8 @@ def test_a_reset_that_fails_is_tried_again():
 SHORT = LinearQuadratic(horizon=1.0)
 
 
-class Breaking(rt.PlantEnv):
-    """A system that raises in the fifth interval of its second window."""
-
-    def _step(self, tensordict):
-        if self._episodes == 2 and self._step_count == 4:
-            raise OSError("the sensor's cable is cut")
-        return super()._step(tensordict)
-
-
-def breaking():
-    return Breaking(SHORT)
-
-
 def endless():
-    places = {name: rt.Reading(keys=(name,)) for name in ("state", "exogenous")}
-    return rt.RealSystem(
-        rt.PlantEnv(LinearQuadratic(horizon=300.0)), SHORT, applied=rt.Reading(keys=("applied",)), **places
-    )
+    return as_reported(rt.PlantEnv(LinearQuadratic(horizon=300.0)), SHORT)
 
 
 @contextlib.contextmanager
@@ -303,24 +247,14 @@ def test_a_policy_takes_over_in_the_other_process_without_a_bump():
 
 
 @pytest.mark.slow
-def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_on():
-    with operation(breaking) as (found, _):
-        with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
-            found.rollout()
-        assert raised.value.flown.shape == (1, 4) and found.rollout().shape == (1, 10)
-
-
-@pytest.mark.slow
 def test_an_acting_process_that_was_killed_is_said():
-    with operation(endless) as (found, other):
+    with operation(endless) as (found, _):
         (process,) = multiprocessing.active_children()
         process.kill()
         process.join()
         with pytest.raises(RuntimeError, match="the acting process has ended without a word"):
             while True:  # windows that came before
                 found.rollout()
-        with pytest.raises(RuntimeError, match="the acting process has ended without a word"):
-            found.hand_over("two", other, strength=0.0)
 
 
 @pytest.mark.slow
@@ -334,7 +268,7 @@ def test_a_run_goes_on_after_a_stop(tmp_path):
 def test_what_cannot_operate_is_refused(tmp_path):
     for make_env, continuous, message in (
         (lambda: rt.PlantEnv(SHORT), False, "cannot be sent to a process of its own"),
-        (breaking, True, "continuous operation needs a RealSystem.*Breaking does not"),
+        (partial(rt.PlantEnv, SHORT), True, "continuous operation needs a RealSystem.*PlantEnv does not"),
     ):
         with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
             pass

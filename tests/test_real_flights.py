@@ -6,6 +6,7 @@ import signal
 
 import pytest
 import torch
+from faulty_system import as_reported
 from figure_reading import draw
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import FULL, IDLE
@@ -13,7 +14,7 @@ from test_algorithm import flown, twinning
 from test_classical import PD
 from test_real_system import Rig, connected
 
-from rt_torchrl import PlantEnv, Reading, RealSystem, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
+from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 
 STEPS = 20
@@ -111,10 +112,10 @@ class Blind(PlantEnv):
 @pytest.mark.parametrize(("blind", "flights"), [((2,), 3), ((2, 3, 4), None)])
 def test_a_judged_flight_with_a_refused_reading_is_flown_again(blind, flights):
     """Its cost would be that of the reading which stands in for it."""
-    plant, entries = LinearQuadratic(horizon=2.0), {key: Reading(keys=(key,)) for key in ("state", "exogenous")}
+    plant = LinearQuadratic(horizon=2.0)
     machine = Blind(plant, seed=0)
     layer = SafetyLayer(machine, SafetyConfig(interval=plant.dt), fallback=(0.0,))
-    system = RealSystem(layer, plant, **entries, applied=Reading(keys=("applied",)), seed=0)
+    system = as_reported(layer, plant)
     begun, machine.blind = machine._episodes, [machine._episodes + k for k in blind]
     if flights is None:
         with pytest.raises(ValueError, match="3 real episodes in a row cannot be used: the safety layer refused 1 of"):
@@ -213,9 +214,7 @@ def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_p
     assert "does not fly the real system: model_" in said and "next: judge the live policy" not in said
 
 
-@pytest.mark.parametrize(
-    "cause", ["the environment terminated the episode after 5 of 20", "ConnectionError: no answer"]
-)
+@pytest.mark.parametrize("cause", ["the environment ended the episode after 5 of 20", "ConnectionError: no answer"])
 def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_training(tmp_path, capsys, cause):
     rig = machine()
 

@@ -137,7 +137,7 @@ def test_a_step_that_does_not_report_what_is_read_is_refused(what):
     rig = Rig(plant)
     step, rig._step = rig._step, lambda row: step(row).exclude(*[FORGOTTEN[what]] * (rig.count >= 3))
     system = connected(plant, rig=rig, applied=Reading(keys=("motor",)))
-    with pytest.raises(ValueError, match=f"{what} is read from .*does not report; it has"):
+    with pytest.raises(ValueError, match=f"{what} is read from .*does not report as an array; it has"):
         system.rollout(20)
     assert system.env.count == 3
 

@@ -2,10 +2,12 @@
 
 import json
 import math
+from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
+from faulty_system import as_reported
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import Time
 from tensordict.nn import TensorDictModule
@@ -13,9 +15,8 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import PlantEnv, Reading, RealSystem, SafetyConfig
-from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, Watchdog, layer_of
-from rt_torchrl.systems.sound_part import report_of
+from rt_torchrl import PlantEnv, SafetyConfig
+from rt_torchrl.systems.safety import ActionLimits, SafetyLayer, Watchdog, report_of
 
 DT = 0.1
 
@@ -56,6 +57,11 @@ def fly(env, asked, steps=None):
     return env.rollout(steps or 20, policy)
 
 
+def counts(env):
+    """The number of intervals in which each reason occurred."""
+    return Counter(reason for event in report_of(env).events for reason in event.reasons)
+
+
 def applied(episode):
     return episode["next", "applied"].flatten().tolist()
 
@@ -90,7 +96,7 @@ def test_nothing_is_touched_within_the_limits():
     episode, bare = fly(env, asked), fly(PlantEnv(LinearQuadratic(horizon=2.0), seed=0), asked)
     for key in ("observation", "state", "reward", "applied", "truncated", "terminated", "done"):
         assert torch.equal(episode["next", key], bare["next", key])
-    assert not env.report.events and not env.report.counts
+    assert not env.report.events
 
 
 def test_a_broken_observation_trips_for_the_hold_time_and_is_held():
@@ -104,7 +110,7 @@ def test_a_broken_observation_trips_for_the_hold_time_and_is_held():
     assert (observation[0, 4:6, 0] == observation[0, 3, 0]).all()
     # The other component was a number and is passed on.
     assert torch.equal(observation[..., 1], episode["next", "state"][..., 1])
-    assert env.report.counts == {"not finite": 2, "fallback": 4}
+    assert counts(env) == {"not finite": 2, "fallback": 4}
     first = env.report.events[0]
     assert (first.step, first.reasons, first.asked, first.applied) == (4, {"not finite": "observation"}, [0.5], [0.5])
     assert first.time == pytest.approx(0.4)
@@ -116,7 +122,7 @@ SPIKE = {"value": 7.0, "ranges": {"observation": ((-5.0, -50.0), (5.0, 50.0))}}
 
 
 @pytest.mark.parametrize(
-    ("options", "asked", "expected", "counts"),
+    ("options", "asked", "expected", "reasons"),
     [
         ({"broken": [4]}, [0.5] * 20, [0.5] * 5 + [-1.0] + [0.5] * 14, {"not finite": 1, "fallback": 1}),
         ({"broken": [3], **SPIKE}, [0.5] * 20, [0.5] * 4 + [-1.0] + [0.5] * 15, {"out of range": 1, "fallback": 1}),
@@ -125,11 +131,11 @@ SPIKE = {"value": 7.0, "ranges": {"observation": ((-5.0, -50.0), (5.0, 50.0))}}
         (FREE, [1.5, -1.5] * 10, [1.5, -1.5] * 10, {}),
     ],
 )
-def test_one_fault_brings_the_fallback_for_one_interval(options, asked, expected, counts):
+def test_one_fault_brings_the_fallback_for_one_interval(options, asked, expected, reasons):
     """A late reading is no wrong one; a value out of range is passed on; infinity limits nothing."""
     env = failing(fallback=(-1.0,), **options)
     episode = fly(env, asked)
-    assert applied(episode) == expected and env.report.counts == counts
+    assert applied(episode) == expected and counts(env) == reasons
     assert episode["next", "refused"].sum() == len(options.get("broken", ()))
     if "value" in options:
         assert episode["next", "observation"][0, 3, 0] == 7.0
@@ -160,7 +166,7 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
     for _ in range(2):
         # The watchdog is tripped at the end of the episode; the next one does not inherit that.
         assert applied(fly(env, [float("nan")] + [3.0] * 19))[:12] == [-1.0] * 10 + [2.0] * 2
-        assert env.report.counts == {"asked": 1, "fallback": 10, "range": 10, "not finite": 1}
+        assert counts(env) == {"asked": 1, "fallback": 10, "range": 10, "not finite": 1}
     found = [json.loads(line) for line in path.read_text().splitlines()]
     assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in (1, 2) for k in range(20)]
     assert found[0]["asked"] == [None] and found[0]["applied"] == [-1.0] and "asked" in found[0]["reasons"]
@@ -169,10 +175,8 @@ def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this machine has no /dev/full")
 def test_a_log_on_a_full_disk_does_not_stop_a_machine_that_moves():
     env = layer(rates=(0.1,), log=Path("/dev/full"))
-    assert fly(env, [1.0] + [-1.0] * 19).shape[1] == 20 and env.report.counts["rate"] == 19
-    with pytest.raises(OSError, match="No space left"):
-        env.reset()
-    env.reset()  # once is enough
+    with pytest.warns(UserWarning, match="events are missing in /dev/full: .*No space left"):
+        assert fly(env, [1.0] + [-1.0] * 19).shape[1] == 20 and counts(env)["rate"] == 19
 
 
 def test_specs_hold_around_both_kinds_of_systems():
@@ -196,11 +200,9 @@ def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_o
     """A transformed environment passes names on to what it transforms, whose own ``env`` is the system in the layer."""
     guarded = failing(broken=[1])
     inner = TransformedEnv(guarded, StepCounter())
-    entries = {name: Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
-    for env in (inner, RealSystem(inner, LinearQuadratic(horizon=2.0), **entries)):
-        assert layer_of(env) is guarded
+    for env in (inner, as_reported(inner, LinearQuadratic(horizon=2.0))):
         fly(env, [0.0] * 3, steps=3)
-        assert report_of(env).wrong == {1} and report_of(env).counts["not finite"] == 1
+        assert report_of(env) is guarded.report and guarded.report.wrong == {1} and counts(env)["not finite"] == 1
 
 
 def test_what_cannot_be_guarded_is_refused():
@@ -212,25 +214,3 @@ def test_what_cannot_be_guarded_is_refused():
     pytest.importorskip("gymnasium")
     with pytest.raises(ValueError, match="continuous entry"):
         layer(GymEnv("CartPole-v1"))
-
-
-# Closing what stands around a machine closes the machine, once.
-
-
-class Machine(PlantEnv):
-    closed = 0
-
-    def close(self, **kwargs):
-        self.closed += 1
-        super().close(**kwargs)
-
-
-def test_a_real_system_behind_a_safety_layer_is_closed():
-    plant = LinearQuadratic(horizon=2.0)
-    machine = Machine(plant)
-    layer = SafetyLayer(machine, SafetyConfig(interval=plant.dt), fallback=(0.0,))
-    entries = {"state": Reading(keys=("state",)), "exogenous": Reading(keys=("exogenous",))}
-    system = RealSystem(layer, plant, **entries, applied=Reading(keys=("applied",)))
-    assert machine.closed == 0
-    system.close()
-    assert machine.closed == 1 and layer.is_closed and system.is_closed

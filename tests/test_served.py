@@ -23,11 +23,9 @@ from seeds_and_numbers import Time, drawn
 from served_plants import free_port, served, served_turbine_alone
 from served_turbine import ServedPlant, machine
 from tensordict import TensorDict
-from test_export_recipe import recipe
 
 import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.systems.operation import Operation, Operator
 
 PLANT = LinearQuadratic(horizon=2.0)
 TAGS = ServedPlant(PLANT, (0.0,))
@@ -62,7 +60,7 @@ class Line:
 
     def __init__(self, time, period, down=(), fails=None):
         self.time, self.period, self.down, self.fails, self.requests = time, period, down, fails or {}, Counter()
-        self.plant = ServedPlant(PLANT, (0.0,))
+        self.plant, self.quality = ServedPlant(PLANT, (0.0,)), {}
         self.answer = {"answered": math.nan, "command.force": math.nan}
 
     def _up(self, request):
@@ -100,11 +98,11 @@ def test_a_client_answers_every_sample_of_the_plant():
     line = Line(Time(), 0.1)
     env = connected(line)
     found = env.rollout(50, lambda td: td.set("action", torch.ones(1).double()))
-    assert env.losses == env.stale == env.skipped == 0
+    assert env.losses == found["next", "skipped"].sum() == 0
     assert (found["next", "applied"] == 1.0).all()
     assert line.time.now == pytest.approx(5.0, rel=0.02)
     line.time.now += 5.0  # between two episodes nobody reads
-    assert env.reset()["skipped"].item() == env.skipped == 0
+    assert env.reset()["skipped"].item() == 0
     line.time.now += 0.35
     env.step(env.step_mdp(found[-1]).set("action", torch.ones(1).double()))
     late = env.pace.late
@@ -131,8 +129,8 @@ def test_a_client_keeps_its_period_while_the_line_is_down_and_goes_on_afterwards
 
 def test_a_plant_that_never_answers_is_said_in_a_sentence():
     line = Line(Time(), 0.1, down=[(0.0, math.inf)])
-    with pytest.raises(ValueError, match="the plant has not answered for patience=2 s: down"):
-        connected(line, patience=2.0).reset()
+    with pytest.raises(ValueError, match="the plant has not answered for 60 s: down"):
+        connected(line).reset()
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -152,8 +150,8 @@ def test_a_plant_behind_a_protocol_does_what_its_twin_computes(protocol):
     flown = TensorDict.cat(rows)
     t, applied = torch.zeros(len(rows)).double(), flown["next", "applied"]
     ends = PLANT.step(t, flown["state"], applied, flown["exogenous"], PLANT.closure).state
-    whole = ~flown["next", "refused"].flatten() & (env.skipped == 0 and env.stale == 0)
-    assert whole.sum() >= 6 or env.skipped or env.stale  # a busy machine may miss a sample
+    whole = ~flown["next", "refused"].flatten()
+    whole[1:] &= whole[:-1].clone()  # a busy machine may miss a sample
     torch.testing.assert_close(ends[whole], flown["next", "state"][whole], rtol=1e-12, atol=1e-12)
 
 
@@ -213,8 +211,6 @@ def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol, 
                 row = acting(system, row, 1)
             assert course.applied[-1] == ASKED, f"the run does not go on after loss {k}"
             row = acting(system, row, 2)
-        env = system.env.env
-        assert env.losses + env.late >= losses  # a short silence is a late answer or two, and no lost connection
         system.close()
         relay.close()
     for moment, following in zip(moments, [*moments[1:], course.times[-1]], strict=True):
@@ -263,7 +259,7 @@ def test_the_example_makes_a_real_system_that_connects_at_its_reset():
     system.env.env.link.close()
 
 
-# Minutes of operation on the wall clock, by ``-m machine``: lost connections while it learns, and the kept period.
+# Minutes of operation on the wall clock, by ``-m machine``: lost connections while it learns.
 
 
 SECONDS = float(os.environ.get("SECONDS_OF_A_MACHINE_TEST", "120"))
@@ -321,47 +317,3 @@ def test_a_soak_logs_every_lost_connection_and_keeps_memory_and_handles(tmp_path
     assert len(lost) >= 3 and all(logged[:-1])  # the last one may outlive the run
     kept = np.array(used[len(used) // 4 :])
     assert (kept[-1, :, 1] <= kept[0, :, 1] + 2).all() and (kept[-1, :, 0] <= 1.1 * kept[0, :, 0]).all()
-
-
-def lateness(operation, learn, seconds):
-    """Lateness of the intervals of a turn [ms], with learning beside it or without."""
-    end, late = time.monotonic() + seconds, []
-    while operation.waiting():
-        operation.rollout()  # windows that began before the turn
-    operation.rollout()
-    while time.monotonic() < end or not late:
-        if learn is not None:
-            learn()
-        while learn is None or operation.waiting():
-            late.append(1e3 * operation.rollout()["late"].flatten().numpy())
-            if learn is None:
-                break
-    return np.concatenate(late)
-
-
-@pytest.mark.machine
-def test_the_period_is_kept_beside_learning_as_without(tmp_path):
-    """Steps 2 to 6 of a training whose real episode is over are taken again and again."""
-    config = dataclasses.replace(recipe("wind_turbine").Config().defaults(), horizon=25.0, log_dir=tmp_path)
-    plant, period = config.plant(), 0.02
-    run = rt.Run(config, plant, first=JonkmanController)
-    episode, policy = run.algorithm(TensorDict({"number": 0})), run.algorithm.policies["model_free"]
-    make_env, options = partial(rt.PlantEnv, plant, seed=1), rt.OperationConfig(speed=plant.dt / period)
-    acting = Operator(make_env, plant, {"model_free": policy}, rt.ExplorationConfig(episodes=0), options, seed=0)
-    operation = Operation(acting, make_env())
-
-    def learn():
-        for name, step in run.algorithm.module.items():
-            if name != "interact":
-                step(episode)
-        operation.hand_over("model_free", policy, strength=0.0)
-
-    try:
-        operation.hand_over("model_free", policy, strength=0.0)
-        late = {name: lateness(operation, beside, SECONDS / 4) for name, beside in (("idle", None), ("busy", learn))}
-    finally:
-        operation.close()
-        run._held.release()
-    for name, times in late.items():
-        print(name, len(times), *np.percentile(times, [50, 99, 100]).round(3), "missed", (times >= 1e3 * period).sum())
-        assert np.median(times) < 2.0 and (times >= 1e3 * period).mean() < 0.1

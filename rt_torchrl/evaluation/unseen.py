@@ -298,7 +298,8 @@ class RealEpisodes(UnseenEpisodes):
         from tensordict.nn import TensorDictModule
 
         from rt_torchrl.systems.collectors import fly
-        from rt_torchrl.systems.sound_part import FLIGHTS, report_of, sound_part, tried_in_vain
+        from rt_torchrl.systems.safety import report_of
+        from rt_torchrl.systems.sound_part import FLIGHTS, sound_part, tried_in_vain
 
         device, refused = self.initial_state.device, list[str]()
         live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))

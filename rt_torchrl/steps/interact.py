@@ -17,13 +17,12 @@ from rt_torchrl.steps.report import Step, in_words, merged, metrics
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation
-from rt_torchrl.systems.safety import OperatingLimits, require_layer
+from rt_torchrl.systems.safety import OperatingLimits, report_of, require_layer
 from rt_torchrl.systems.sound_part import (
     FLIGHTS,
     EpisodeEndedError,
     Fault,
     SoundPart,
-    report_of,
     sound_part,
     tried_in_vain,
 )

@@ -2,8 +2,7 @@
 
 import contextlib
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -22,6 +21,8 @@ from rt_torchrl.systems.environment import ForeignSystem
 Report = Mapping[str, np.ndarray | Sequence[float]]
 Controller = Callable[[Report], np.ndarray]
 Simulation = Callable[[int, Controller], None]
+Reports = SimpleQueue[Report | BaseException | None]
+Actions = SimpleQueue[np.ndarray | None]
 Start = Callable[[torch.Generator], Mapping[str, float]]
 """Draws the values that variables of the FMU are set to before an episode, by name."""
 
@@ -63,14 +64,17 @@ class CallingSimulator(ForeignSystem):
             raise ValueError(f"reports={dict(reports)} and actions={list(actions)} must not be empty.")
         super().__init__(reports, actions, seed=seed)
         self._simulate, self._sizes = simulate, dict(reports)
-        self._conversation: _Conversation | None = None
+        self._thread: Thread | None = None
+        """The thread of the episode that is running."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self.end_episode()
-        self._conversation = _Conversation(self._simulate, self._seed)
+        self._reports, self._actions = Reports(), Actions()
+        self._thread = Thread(target=self._run, args=(self._seed, self._reports, self._actions), daemon=True)
+        self._thread.start()
         self._action = self.action_spec.zero().numpy()
         self._seed += 1
-        first = self._conversation.listen()
+        first = self._listen()
         if first is None:
             raise RuntimeError("the simulator has ended its episode without calling its controller once.")
         self._last = self._entries(first)
@@ -78,14 +82,42 @@ class CallingSimulator(ForeignSystem):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step to the next call of the controller; once the simulator has ended, repeat its last report and be done."""
-        if self._conversation is None or self._conversation.ended:
+        if self._thread is None:
             raise RuntimeError("no episode is running; reset the environment before it is stepped.")
         self._action = tensordict["action"].numpy().copy()
-        self._conversation.answer(self._action)
-        reported = self._conversation.listen()
+        self._actions.put(self._action)
+        reported = self._listen()
         if reported is not None:
             self._last = self._entries(reported)
         return self._stepped(self._last.clone(), ended=reported is None)
+
+    def _run(self, seed: int, reports: Reports, actions: Actions) -> None:
+        """Run an episode in its thread, whose calls of the controller are answered from another one."""
+
+        def controller(reported: Report) -> np.ndarray:
+            reports.put(dict(reported))
+            action = actions.get()
+            if action is None:
+                actions.put(None)  # for every further call
+                raise EpisodeAbandoned
+            return action
+
+        try:
+            self._simulate(seed, controller)
+        except EpisodeAbandoned:
+            pass
+        except BaseException as error:  # any error goes to the thread that steps, because nobody sees this one
+            reports.put(error)
+        reports.put(None)
+
+    def _listen(self) -> Report | None:
+        """The next report of the simulator to its controller; None once the simulator has ended."""
+        reported = self._reports.get()
+        if reported is None or isinstance(reported, BaseException):
+            self._thread = None
+        if isinstance(reported, BaseException):
+            raise RuntimeError(f"the simulator failed: {type(reported).__name__}: {reported}") from reported
+        return reported
 
     def _entries(self, reported: Report) -> TensorDict:
         entries: dict[str, Tensor] = {}
@@ -100,83 +132,24 @@ class CallingSimulator(ForeignSystem):
 
     def end_episode(self) -> None:
         """Let the simulator finish its episode, or abandon the rest of it; nothing is done where no episode runs."""
-        conversation, self._conversation = self._conversation, None
-        if conversation is None or conversation.ended:
+        thread = self._thread
+        if thread is None:
             return
-        conversation.answer(self._action)
-        if conversation.listen() is not None:
-            conversation.abandon(self.patience)
+        self._actions.put(self._action)
+        if self._listen() is None:
+            return
+        self._thread = None
+        self._actions.put(None)
+        thread.join(self.patience)
+        if thread.is_alive():
+            raise RuntimeError(
+                f"the simulator has not returned {self.patience:g} s after its episode was abandoned; let "
+                "EpisodeAbandoned, which its controller raises then, end it."
+            )
 
     def close(self, **kwargs: Any) -> None:
         self.end_episode()
         super().close(**kwargs)
-
-
-class _Conversation:
-    """One episode of a simulator in a thread of its own, whose calls of the controller are answered from this thread.
-
-    ``ended`` is true once the simulator has returned or failed: nobody listens to an answer any more.
-
-    Args:
-        simulate: function that runs the episode.
-        seed: seed of the episode.
-    """
-
-    def __init__(self, simulate: Simulation, seed: int):
-        self._simulate, self._seed, self.ended, self._abandoned = simulate, seed, False, False
-        self._reports: SimpleQueue[Report | BaseException | None] = SimpleQueue()
-        self._actions: SimpleQueue[np.ndarray | None] = SimpleQueue()
-        self._thread = Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._simulate(self._seed, self._ask)
-        except EpisodeAbandoned:
-            pass
-        except BaseException as error:  # any error goes to the thread that steps, because nobody sees this one
-            self._reports.put(error)
-        self._reports.put(None)
-
-    def _ask(self, reported: Report) -> np.ndarray:
-        action = None
-        if not self._abandoned:
-            self._reports.put(dict(reported))
-            action = self._actions.get()
-        if action is None:
-            raise EpisodeAbandoned
-        return action
-
-    def listen(self) -> Report | None:
-        """The next report of the simulator to its controller; None once the simulator has ended.
-
-        Raises:
-            RuntimeError: if the simulator has failed; the simulator's own error is its cause.
-        """
-        reported = self._reports.get()
-        self.ended = reported is None or isinstance(reported, BaseException)
-        if isinstance(reported, BaseException):
-            raise RuntimeError(f"the simulator failed: {type(reported).__name__}: {reported}") from reported
-        return reported
-
-    def answer(self, action: np.ndarray | None) -> None:
-        """Answer the simulator with the controller's action, or with None to abandon the episode."""
-        self._actions.put(action)
-
-    def abandon(self, patience: float) -> None:
-        """Abandon the rest of the episode and wait for the simulator to return.
-
-        Raises:
-            RuntimeError: if it does not return within ``patience`` [s].
-        """
-        self._abandoned = True
-        self.answer(None)
-        self._thread.join(patience)
-        if self._thread.is_alive():
-            raise RuntimeError(
-                f"the simulator has not returned {patience:g} s after its episode was abandoned; let EpisodeAbandoned, "
-                "which its controller raises then, end it."
-            )
 
 
 class FMUError(RuntimeError):
@@ -218,7 +191,16 @@ class FMUEnvironment(ForeignSystem):
     ):
         super().__init__({"outputs": len(outputs), "exogenous": len(plant.inputs)}, plant.actions, seed=seed)
         self._fmpy, self.path, self.plant = _fmpy(), Path(path), plant
-        self._description, self._places = self._read()
+        try:
+            self._description = self._fmpy.read_model_description(str(self.path))
+        except Exception as error:  # FMPy raises whatever its parser meets
+            raise ValueError(f"path={self.path} is no FMU that can be read: {error}") from error
+        version = self._description.fmiVersion
+        if self._description.coSimulation is None or not version.startswith("2."):
+            raise ValueError(f"path={self.path} is an FMU of FMI {version}; it must be one of FMI 2 for co-simulation.")
+        # Of other types the same references are other variables.
+        real = [variable for variable in self._description.modelVariables if variable.type == "Real"]
+        self._places = {variable.name: variable.valueReference for variable in real}
         if len(actions) != len(plant.actions):
             count = len(plant.actions)
             raise ValueError(f"actions={tuple(actions)} must name {count} variables, one for each of the plant's.")
@@ -230,24 +212,9 @@ class FMUEnvironment(ForeignSystem):
         self._fmu: Any = None  # FMPy says no types
         self._folder = self._fmpy.extract(str(self.path))
 
-    def _read(self) -> tuple[Any, dict[str, int]]:
-        try:
-            description = self._fmpy.read_model_description(str(self.path))
-        except Exception as error:  # FMPy raises whatever its parser meets
-            raise ValueError(f"path={self.path} is no FMU that can be read: {error}") from error
-        if description.coSimulation is None or not description.fmiVersion.startswith("2."):
-            raise ValueError(
-                f"path={self.path} is an FMU of FMI {description.fmiVersion}; it must be one of FMI 2 for "
-                "co-simulation."
-            )
-        # Of other types the same references are other variables.
-        real = [variable for variable in description.modelVariables if variable.type == "Real"]
-        return description, {variable.name: variable.valueReference for variable in real}
-
     def _require(self, names: Mapping[str, Sequence[str]]) -> None:
         for what, variables in names.items():
-            unknown = [name for name in variables if name not in self._places]
-            if unknown:
+            if unknown := [name for name in variables if name not in self._places]:
                 raise ValueError(
                     f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "
                     f"{', '.join(self._places)}."
@@ -260,14 +227,15 @@ class FMUEnvironment(ForeignSystem):
         self._require({"start": list(start)})
         self._inputs = self.plant.draw_exogenous(1, generator)[0]
         self._free()
-        instantiate = partial(self._fmpy.simulation.instantiate_fmu, self._folder, self._description, "CoSimulation")
-        fmu = self._fmu = self._call("instantiate", instantiate)
-        self._call("setupExperiment", partial(fmu.setupExperiment, startTime=0.0, stopTime=self.plant.horizon))
-        self._set(start)
-        self._call("enterInitializationMode", fmu.enterInitializationMode)
-        self._set(dict(zip(self._exogenous, self._now().tolist(), strict=False)))
-        self._call("exitInitializationMode", fmu.exitInitializationMode)
-        return self._report()
+        with self._named_errors():
+            fmu = self._fmpy.simulation.instantiate_fmu(self._folder, self._description, "CoSimulation")
+            self._fmu = fmu
+            fmu.setupExperiment(startTime=0.0, stopTime=self.plant.horizon)
+            self._set(start)
+            fmu.enterInitializationMode()
+            self._set(dict(zip(self._exogenous, self._now().tolist(), strict=False)))
+            fmu.exitInitializationMode()
+            return self._report()
 
     def _now(self) -> Float[Tensor, " n_z"]:
         return self._inputs[min(self._steps, len(self._inputs) - 1)]
@@ -277,30 +245,30 @@ class FMUEnvironment(ForeignSystem):
             raise RuntimeError("no episode is running; reset the environment before it is stepped.")
         values = dict(zip(self._actions, tensordict["action"].tolist(), strict=True))
         values |= dict(zip(self._exogenous, self._now().tolist(), strict=False))
-        self._set(values)
         t, dt = self._steps * self.plant.dt, self.plant.dt
-        self._call("doStep", partial(self._fmu.doStep, currentCommunicationPoint=t, communicationStepSize=dt))
-        self._steps += 1
-        return self._stepped(self._report())
+        with self._named_errors():
+            self._set(values)
+            self._fmu.doStep(currentCommunicationPoint=t, communicationStepSize=dt)
+            self._steps += 1
+            return self._stepped(self._report())
 
     def _set(self, values: Mapping[str, float]) -> None:
         if values:
-            places = [self._places[name] for name in values]
-            self._call(f"set {', '.join(values)}", partial(self._fmu.setReal, places, list(values.values())))
+            self._fmu.setReal([self._places[name] for name in values], list(values.values()))
 
     def _report(self) -> TensorDict:
-        places = [self._places[name] for name in self._outputs]
-        values = self._call(f"get {', '.join(self._outputs)}", partial(self._fmu.getReal, places))
+        values = self._fmu.getReal([self._places[name] for name in self._outputs])
         outputs = torch.tensor(list(values), dtype=torch.float64)
         return TensorDict({"outputs": outputs, "exogenous": self._now().clone()}, batch_size=self.batch_size)
 
-    def _call(self, what: str, call: Callable[[], Any]) -> Any:
+    @contextlib.contextmanager
+    def _named_errors(self) -> Iterator[None]:
+        """Errors of FMPy, which name the call, with the FMU and the time."""
         try:
-            return call()
+            yield
         except Exception as error:  # FMPy raises plain exceptions
-            raise FMUError(
-                f"the FMU {self.path.name} refuses to {what} at t = {self._steps * self.plant.dt:g} s: {error}"
-            ) from error
+            t = self._steps * self.plant.dt
+            raise FMUError(f"the FMU {self.path.name} refuses a call at t = {t:g} s: {error}") from error
 
     def _free(self) -> None:
         """Free the FMU, which need not be able to end its simulation: after an error it may refuse."""

@@ -122,8 +122,7 @@ class EpisodeCollector(BaseCollector):
         return cast(TensorDict, together(flown))
 
     def _begin(self) -> TensorDictBase:
-        pass_over(self.env)
-        first_row = self.env.reset()
+        first_row = reset(self.env)
         if not isinstance(self.actor.policy, StateFeedback):
             require_pure_policy(self.actor.policy, first_row["observation"])
         return first_row
@@ -169,7 +168,7 @@ def fly(
         if plant.end_cost is not None and stepped["next", "terminated"].any():
             break
         if stepped["next", "done"].any() and k + 1 < plant.n_steps:
-            return flown, str(ended_early(stepped["next"], k + 1, plant))
+            return flown, str(ended_early(k + 1, plant))
         row = env.step_mdp(stepped)
     return flown, None
 
@@ -216,8 +215,7 @@ class FlightCollector(EpisodeCollector):
         law = policy if isinstance(policy, Remembering) else None
         if isinstance(policy, StateFeedback) and law is None:
             return super().rollout()
-        env.pass_over()
-        env.reset()
+        reset(env)
         closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn
         n, plant = exogenous.shape[1], env.plant
         noise = torch.stack([self.actor.draw_noise((len(initial_state), len(plant.actions))) for _ in range(n)], 1)
@@ -261,10 +259,11 @@ MakeCollector = Callable[[EnvBase, LivePolicy, Plant], BaseCollector]
 episode of batch size ``1 n``."""
 
 
-def pass_over(env: EnvBase) -> None:
-    """Make a simulation pass over one draw before an episode, also where it is behind a safety layer."""
+def reset(env: EnvBase) -> TensorDictBase:
+    """Begin an episode of the algorithm; a simulation, also one behind a safety layer, passes over one draw before."""
     if hasattr(env, "pass_over"):
         env.pass_over()
+    return env.reset()
 
 
 def flown(

@@ -91,9 +91,8 @@ class OperatingLimitsConfig:
 
     def __post_init__(self) -> None:
         for argument in ("states", "actions"):
-            for name, (low, high) in getattr(self, argument).items():
-                if not low < high:
-                    raise ValueError(f"limits.{argument} {name}={low} to {high} must have its least value first.")
+            for name, ends in getattr(self, argument).items():
+                _require_order(f"limits.{argument} {name}", *ends)
 
     def __bool__(self) -> bool:
         """Whether there is any limit."""

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from rt_torchrl.options import require_number
+from rt_torchrl.options import require_number, require_range
 from rt_torchrl.plants.plant import Plant, with_memories
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -60,9 +60,7 @@ class PlantEnv(EnvBase):
         wear: Callable[[int], nn.Module] | None = None,
     ):
         require_number("seed", seed, whole=True)
-        require_number("noise", noise)
-        if not 0.0 <= noise < 1.0:
-            raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
+        require_range("noise", noise, 0.0, 1.0, unit="-", of="the sensors")
         super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
         self.plant = plant.to(device)
         self._generator = torch.Generator(device=device)
@@ -183,28 +181,20 @@ class PlantEnv(EnvBase):
         return t, self._exogenous[:, min(k, self.plant.n_steps - 1)]
 
 
-def declare_specs(env: EnvBase, plant: Plant) -> None:
-    """Give an environment the entries of a plant; see :class:`PlantEnv`."""
+def declare_specs(env: EnvBase, plant: Plant, *, refused: bool = False) -> None:
+    """Give an environment the entries of a plant, see :class:`PlantEnv`, and ``refused`` where a layer judges them."""
     batch, device = env.batch_size, env.device
-
-    def unbounded(n: int) -> Unbounded:
-        return Unbounded(shape=(*batch, n), dtype=torch.float64, device=device)
-
-    n_o, n_r, n_a, n_z = map(len, (plant.observations, plant.readings, plant.actions, plant.inputs))
-    env.observation_spec = Composite(
-        observation=unbounded(n_o),
-        state=unbounded(n_r),
-        exogenous=unbounded(n_z),
-        applied=unbounded(n_a),
-        shape=batch,
-        device=device,
-    )
-    low, high = bounds(plant.actions, device=device)
-    env.action_spec = Bounded(
-        low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
-    ).to(device)
-    env.reward_spec = unbounded(1)
     flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+    groups = {"observation": plant.observations, "state": plant.readings}
+    groups |= {"exogenous": plant.inputs, "applied": plant.actions}
+    entries: dict[str, TensorSpec] = {
+        key: Unbounded(shape=(*batch, len(group)), dtype=torch.float64, device=device) for key, group in groups.items()
+    }
+    entries |= {"refused": flag.clone()} if refused else {}
+    env.observation_spec = Composite(entries, shape=batch, device=device)
+    low, high = (end.expand(*batch, -1) for end in bounds(plant.actions, device=device))
+    env.action_spec = Bounded(low=low, high=high, shape=low.shape, dtype=torch.float64).to(device)
+    env.reward_spec = Unbounded(shape=(*batch, 1), dtype=torch.float64, device=device)
     env.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device)
 
 
@@ -236,20 +226,17 @@ class ForeignSystem(EnvBase):
         return reported.update(ends)
 
 
-def ended_early(reported: TensorDictBase, count: int, plant: Plant) -> ValueError:
+def ended_early(count: int, plant: Plant) -> ValueError:
     """The error that says that an environment has ended an episode where its plant does not.
 
     Args:
-        reported: the environment's report at the end of the episode.
         count: number of control intervals until that end.
         plant: plant whose horizon the episode has not reached.
     """
-    terminated = "terminated" in reported and reported["terminated"].any()
     return ValueError(
-        f"the environment {'terminated' if terminated else 'truncated'} the episode after {count} of {plant.n_steps} "
-        f"control intervals of plant {plant.name!r}, which does not end there. If it may, let the plant say so by "
-        f"ended(state) and end_cost; or use a horizon of at most {count * plant.dt:g} s, or an environment that goes "
-        "on."
+        f"the environment ended the episode after {count} of {plant.n_steps} control intervals of plant "
+        f"{plant.name!r}, which does not end there. If it may, let the plant say so by ended(state) and end_cost; or "
+        f"use a horizon of at most {count * plant.dt:g} s, or an environment that goes on."
     )
 
 

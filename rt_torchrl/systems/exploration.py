@@ -82,12 +82,7 @@ class LivePolicy(nn.Module):
         self._noise: Tensor | None = None
         self._scale = 0.5 * config.noise * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
-        self.generator, self._plant = generator, (plant,)
-
-    @property
-    def plant(self) -> Plant:
-        """Plant that gives the ranges of the actions and the control interval."""
-        return self._plant[0]
+        self.generator = generator
 
     def begin(self, policy: nn.Module, *, strength: float) -> None:
         """Start an episode with the policy that is live now and ξ = ``strength``; state feedback gets ready for it."""
@@ -142,18 +137,16 @@ class BumplessPolicy(LivePolicy):
 
     .. math::
         a_k = \pi_{new}(e_k) + b_k, \qquad b_h = a_h^{old} - \pi_{new}(e_h), \qquad
-        |b_{k+1}| = \max(0, |b_k| - r_k)
+        |b_{k+1}| = \max(0, |b_k| - r)
 
-    The action of interval h is what the old policy would have sent. From then on the handover adds at most
-    :math:`r_k = \min(\text{range}/n, \tfrac12\,\text{reach})` to the action in an interval: the range of the action
-    over n intervals, and never more than the actuators' own rate. The reach is the width of what ``plant.actuate`` can
-    make of commands in the present state within one interval.
+    The action of interval h is what the old policy would have sent. From then on the handover adds at most r to the
+    action in an interval: its range over n intervals.
 
     Integrators and filters of a plant are among its states, so that they carry over. State feedback that takes over
     begins with its first memory.
 
     Args:
-        plant: plant that gives the ranges of the actions, the actuators and the control interval.
+        plant: plant that gives the ranges of the actions and the control interval.
         policy: the policy that is live.
         config: parameters of the noise.
         intervals: number n of control intervals in which an offset as wide as the whole range fades.
@@ -198,8 +191,9 @@ class BumplessPolicy(LivePolicy):
     ) -> Float[Tensor, "*batch n_a"]:
         """The command of the policy and what is left of the offset."""
         command = super().commanded(policy, observation, state, exogenous)
-        if self._offset is not None and state is not None:
-            self._offset = self._faded(self._offset, state)
+        if self._offset is not None:
+            left = self._offset.sign() * (self._offset.abs() - self._share).clamp(min=0.0)
+            self._offset = left if left.any() else None
         if self._former is not None:
             before = super().commanded(self._former, observation, state, exogenous)
             before = before if self._offset is None else before + self._offset
@@ -207,10 +201,3 @@ class BumplessPolicy(LivePolicy):
             # A policy that asked for no number leaves nothing behind.
             self._former, self._offset = None, offset.nan_to_num(0.0, 0.0, 0.0)
         return command if self._offset is None else command + self._offset
-
-    def _faded(self, offset: Tensor, state: Tensor) -> Tensor | None:
-        full = self.plant.at_rest(state)
-        ends = [self.plant.actuate(full, end.expand_as(offset)) for end in (self.low, self.high)]
-        step = torch.minimum(self._share, 0.5 * (ends[1] - ends[0]).abs())
-        left = offset.sign() * (offset.abs() - step).clamp(min=0.0)
-        return left if left.any() else None

@@ -3,6 +3,7 @@
 docs/connect_your_machine.md explains it.
 """
 
+import contextlib
 import copy
 import gc
 import multiprocessing
@@ -12,9 +13,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -23,12 +25,12 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.collectors import fly, pass_over, together
+from rt_torchrl.systems.collectors import fly, reset, together
 from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.systems.exploration import BumplessPolicy, ExplorationConfig
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.systems.safety import SafetyReport
-from rt_torchrl.systems.sound_part import EpisodeEndedError, report_of
+from rt_torchrl.systems.safety import SafetyReport, report_of
+from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 FIRST = "first"
@@ -41,7 +43,6 @@ END = 10.0
 """Time that the acting process has to end the operation [s]."""
 SWITCH = 2e-4
 """Time for which a thread keeps Python's lock while the control loop waits for it [s]."""
-STOP = "stop"
 
 
 class Order(NamedTuple):
@@ -78,21 +79,17 @@ class Window(NamedTuple):
     """A window of operation, or the part of it before the system failed.
 
     Attributes:
-        entries: its control intervals, of batch size ``1 k``, None if there are none; before they are :meth:`stacked`,
-            a list of them.
+        entries: its control intervals, None if there are none: a list of them where they are flown, one TensorDict of
+            batch size ``1 k`` where they are taken.
         ended: why the system did not reach the end of the window; None if it did.
         report: what the safety layer did in it; None if there is no layer.
         acted: numbers about what acted at its end, such as the times of the solves of model predictive control.
     """
 
-    entries: TensorDict | list[TensorDictBase] | None
+    entries: Any
     ended: str | None = None
     report: SafetyReport | None = None
     acted: Mapping[str, float] | None = None
-
-    def stacked(self) -> "Window":
-        """The window with its control intervals in one TensorDict."""
-        return self._replace(entries=together(self.entries)) if isinstance(self.entries, list) else self
 
 
 class Pace:
@@ -144,6 +141,7 @@ class Pace:
         return self.late
 
 
+@dataclass
 class Operator:
     """Steps a real system under the policies that it is ordered to follow.
 
@@ -169,44 +167,26 @@ class Operator:
         seed: seed of the noise.
     """
 
-    def __init__(
-        self,
-        make_env: Callable[[], EnvBase],
-        plant: Plant,
-        policies: dict[str, nn.Module],
-        exploration: ExplorationConfig,
-        config: OperationConfig,
-        *,
-        seed: int,
-    ):
-        self._make_env, self._exploration, self._seed = make_env, exploration, seed
-        self.plant, self.policies, self.config = plant, policies, config
-        self._begun = False
-        self._order: Order | None = None
+    make_env: Callable[[], EnvBase]
+    plant: Plant
+    policies: dict[str, nn.Module]
+    exploration: ExplorationConfig
+    config: OperationConfig
+    seed: int
 
     def start(self) -> None:
         """Make the real system, and what acts on it."""
-        self.env = self._make_env()
+        self.env, self._begun = self.make_env(), False
+        self._order: Order
         generator, first = torch.Generator(device=self.env.device), next(iter(self.policies.values()))
-        generator.manual_seed(self._seed)
-        self.actor = BumplessPolicy(self.plant, first, self._exploration, intervals=HANDOVER, generator=generator)
+        generator.manual_seed(self.seed)
+        self.actor = BumplessPolicy(self.plant, first, self.exploration, intervals=HANDOVER, generator=generator)
         pace: Pace | None = getattr(self.env, "pace", None)
         self._keeps_time = pace is None
         self.pace = Pace(self.plant.dt / self.config.speed) if pace is None else pace
 
-    @property
-    def version(self) -> int:
-        """Number of the order that is followed; -1 before the first."""
-        return -1 if self._order is None else self._order.version
-
-    def follow(self, order: Order, policy: nn.Module | None = None) -> None:
-        """Let the policy of an order take over in the next interval.
-
-        Args:
-            order: the order.
-            policy: its policy, ready to act; None makes it.
-        """
-        policy = order.ready(self.policies) if policy is None else policy
+    def follow(self, order: Order, policy: nn.Module) -> None:
+        """Let the policy of an order, which is ready to act, take over in the next interval."""
         if self._begun:
             self.actor.hand_over(policy, strength=order.strength)
         else:
@@ -214,46 +194,42 @@ class Operator:
         self._order = order
 
     @torch.no_grad()
-    def window(self, receive: Callable[[], None] = lambda: None) -> Window:
+    def window(self, receive: Callable[[], None]) -> Window:
         """Act for a window.
 
         Args:
-            receive: function that is called before each interval, and may give orders to :meth:`follow`.
+            receive: function that is called before each interval, and may give orders to :meth:`follow`; the first
+                order comes before the first window.
 
         Raises:
-            ValueError: if there is no order yet.
             DivergenceError: if the system is a simulation that diverges.
         """
         receive()
-        if self._order is None:
-            raise ValueError("nothing acts yet: give the operator its first order.")
 
         def act(k: int, row: TensorDictBase) -> TensorDictBase:
             if k:
                 receive()
             if self._keeps_time:
                 self.pace.wait()
-            row["version"] = torch.full((1, 1), self.version)
+            row["version"] = torch.full((1, 1), self._order.version)
             row["late"] = torch.full((1, 1), self.pace.late, dtype=torch.float64)
             return row.set("action", self.actor(row["observation"], row["state"], row["exogenous"]))
 
         rows, why = fly(self.env, self._begin, act, self.plant)
         self._begun = self.config.continuous and why is None
         if not rows:
-            return Window(rows, why)
+            return Window(None, why)
         policy = self.actor.policy
         acted = policy.report() if isinstance(policy, StateFeedback) else None
         return Window(rows, why, report_of(self.env), acted)
 
     def _begin(self) -> TensorDictBase:
         """Begin a window, and return what is read first."""
-        assert self._order is not None
         if self._begun:
             assert isinstance(self.env, RealSystem)
             self.actor.begin_window()
             return self.env.go_on()
-        pass_over(self.env)
-        first_row = self.env.reset()
+        first_row = reset(self.env)
         self.actor.begin(self.actor.policy, strength=self._order.strength)
         if self._keeps_time:
             self.pace.begin()
@@ -265,7 +241,7 @@ class Operator:
         return {
             "env": self.env.state_dict(),
             "generator": self.actor.generator.get_state(),
-            "order": None if self._order is None else self._order._asdict(),
+            "order": self._order._asdict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -275,9 +251,8 @@ class Operator:
         """
         self.env.load_state_dict(state["env"])
         self.actor.generator.set_state(state["generator"].cpu())
-        self._order, self._begun = None, False
-        if state["order"] is not None:
-            self.follow(Order(**state["order"]))
+        order = Order(**state["order"])
+        self.follow(order, order.ready(self.policies))
 
 
 class Operation:
@@ -288,7 +263,7 @@ class Operation:
     control loop waits for nothing but its clock.
 
     The process that acts begins with the first order, and ends with :meth:`close` or with the process of the learner. A
-    failure of it is a RuntimeError in :meth:`rollout` or :meth:`hand_over`, whose message is the process's own.
+    failure of it is a RuntimeError in :meth:`rollout`, whose message is the process's own.
 
     ``orders`` holds the orders, by version, that later windows may have flown, or that the last one has. ``report`` is
     what the safety layer did in the window taken last, and ``acted`` numbers about what acted at its end, if there are
@@ -327,8 +302,7 @@ class Operation:
     @property
     def closure(self) -> nn.Module | None:
         """The true closure of the system, as far as it is known."""
-        closure: nn.Module | None = self.system.closure
-        return closure
+        return cast(nn.Module | None, self.system.closure)
 
     def hand_over(
         self, name: str, policy: nn.Module, *, strength: float, report: dict[str, float | str] | None = None
@@ -347,13 +321,10 @@ class Operation:
         self.version, self.orders[order.version] = order.version, order
 
     def _pass_on(self, order: Order) -> None:
-        """Pass an order on to what acts."""
+        """Pass an order on to what acts; why a process has ended is an error of its windows."""
         connection = self._begun()
-        try:
+        with contextlib.suppress(OSError):
             connection.send_bytes(pickle.dumps(order))
-        except OSError:
-            while True:
-                self._received(connection)  # after the windows, what the process has said at its end is raised
 
     def _begun(self) -> Connection:
         """The connection to the acting process, which is started where there is none."""
@@ -396,13 +367,12 @@ class Operation:
             acting: version that acts at its end.
         """
         entries, self.report, self.acted = window.entries, window.report, window.acted
-        assert not isinstance(entries, list)
         versions = [] if entries is None else entries["version"].flatten().tolist()
         oldest = min([acting, *versions])
         self.orders = {version: order for version, order in self.orders.items() if version >= oldest}
         if window.ended is not None or entries is None:
             raise EpisodeEndedError(window.ended or "the window holds no interval", entries)
-        return entries
+        return cast(TensorDict, entries)
 
     def _received(self, connection: Connection) -> list[Any]:
         """The next window of the acting process, and its state; an error where it has failed or ended."""
@@ -418,17 +388,13 @@ class Operation:
         """End the operation; the system gets its safe action from whatever stands behind it."""
         if self._process is None or self._connection is None:
             return
-        try:
-            self._connection.send_bytes(pickle.dumps(STOP))
-            while self._process.is_alive() and self._connection.poll(END):
-                self._connection.recv_bytes()  # windows that nobody takes would keep it from ending
-        except (EOFError, OSError):
-            pass
+        with contextlib.suppress(OSError):
+            self._connection.send_bytes(pickle.dumps(None))
+        self._connection.close()  # also for a window that nobody takes any more
         self._process.join(END)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-        self._connection.close()
         self._process = self._connection = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -490,21 +456,17 @@ def _operate(
 ) -> None:
     operator.start()
 
-    def follow(order: Any) -> None:
-        if order == STOP:
-            raise _Stopped
-        if isinstance(order, Exception):  # of the receiving thread
-            raise order
-        operator.follow(*order)
-
-    def receive() -> None:
-        while not orders.empty():
-            follow(orders.get())
+    def receive(*, wait: bool = False) -> None:
+        while wait or not orders.empty():
+            order, wait = orders.get(), False
+            if isinstance(order, Exception):  # of the receiving thread
+                raise order
+            operator.follow(*order)
 
     try:
         if state is not None:
             operator.load_state_dict(state)
-        follow(orders.get())
+        receive(wait=True)
         gc.collect()
         gc.freeze()  # a collection of all objects that the libraries have made would stop an action
         while True:
@@ -518,23 +480,23 @@ def _operate(
 
 
 def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[str, nn.Module]) -> None:
+    end: Exception = _Stopped()
     try:
-        while True:
-            order = pickle.loads(connection.recv_bytes())
+        while (order := pickle.loads(connection.recv_bytes())) is not None:
             # A policy is made in less than a millisecond, and state feedback with its first plan in seconds.
-            orders.put(STOP if order == STOP else (order, order.ready(policies)))
+            orders.put((order, order.ready(policies)))
     except (EOFError, OSError):
-        orders.put(STOP)  # a learner that has gone
+        pass  # a learner that has gone
     except Exception as error:  # such as a model that diverges under every first plan
-        orders.put(error)
+        end = error
+    orders.put(end)
 
 
 def _send(connection: Connection, windows: SimpleQueue[Any]) -> None:
-    try:
+    with contextlib.suppress(OSError):  # of a learner that has gone
         while (message := windows.get()) is not None:
             kind, *parts = message
-            # The stack of a window takes long, and would keep the control loop waiting.
-            parts = [part.stacked() if isinstance(part, Window) else part for part in parts]
+            if kind == "window":  # whose stack takes long, and would keep the control loop waiting
+                window, state = parts
+                parts = [window._replace(entries=together(window.entries)), state]
             connection.send_bytes(pickle.dumps((kind, *parts)))
-    except OSError:
-        return  # a learner that has gone

@@ -17,7 +17,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +29,8 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal, bounds, differences
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.signal import Signal, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.sound_part import sound_part
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -82,8 +83,8 @@ class WiringError(ValueError):
 class Flown(NamedTuple):
     """Control intervals of short flights, as they were read or as a mistake would have them; ``n`` rows each.
 
-    The earlier actions and inputs are those of the interval before; ``ratio`` is the real control interval by the
-    plant's, and ``signs`` are those of the equations of the states.
+    The earlier actions are those of the interval before; ``ratio`` is the real control interval by the plant's, and
+    ``signs`` are those of the equations of the states.
     """
 
     t: Float[Tensor, " n"]
@@ -92,22 +93,20 @@ class Flown(NamedTuple):
     exogenous: Float[Tensor, "n n_z"]
     ends: Float[Tensor, "n n_s"]
     earlier_actions: Float[Tensor, "n n_a"]
-    earlier_exogenous: Float[Tensor, "n n_z"]
     ratio: float = 1.0
     signs: Float[Tensor, " n_s"] | float = 1.0
 
 
-class Suspicion(NamedTuple):
-    """A wiring, as it is or with a mistake, and the share of each state's movement that it leaves unexplained."""
+class Unexplained(NamedTuple):
+    """The share of each state's movement that predictions leave unexplained, and their RMS error in its unit."""
 
-    mistake: str
-    unexplained: Float[Tensor, " n_s"]
+    share: Float[Tensor, " n_s"]
     error: Float[Tensor, " n_s"]
 
     @property
     def score(self) -> float:
         r""":math:`\sum_i \log q_i`, of the states that move."""
-        return float(self.unexplained[self.unexplained.isfinite()].clamp(FLOOR, WORST).log().sum())
+        return float(self.share[self.share.isfinite()].clamp(FLOOR, WORST).log().sum())
 
 
 class Wiring(NamedTuple):
@@ -115,8 +114,8 @@ class Wiring(NamedTuple):
 
     Args:
         plant: plant that gives the states.
-        present: the wiring as it is; ``error`` is the RMS error of one-step predictions, in the units of the states.
         moved: RMS movement of each state in an interval, in its unit.
+        present: what the wiring as it is leaves unexplained.
         mistakes: the readings that are wrong by themselves, of which no other wiring is tried: a state that stands
             still where the twin moves, two signals with the same readings, an input far outside its draws; or the
             mistakes that fit much better, the best one first. Empty if the wiring is right or nothing fits.
@@ -124,29 +123,18 @@ class Wiring(NamedTuple):
     """
 
     plant: Plant
-    present: Suspicion
     moved: Float[Tensor, " n_s"]
-    mistakes: tuple[Suspicion, ...]
-    doubts: tuple[str, ...] = ()
+    present: Unexplained
+    mistakes: tuple[str, ...]
+    doubts: tuple[str, ...]
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
-        signals = zip(self.plant.states, self.moved.tolist(), *self.present[1:], strict=True)
-        for signal, moved, unexplained, error in signals:
-            share = f"{100.0 * unexplained:.3g} % unexplained" if math.isfinite(unexplained) else "it does not move"
-            rows.append(f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted to {error:.4g}; {share}")
-        for mistake in self.mistakes:
-            shares = ", ".join(
-                f"{signal.name} {100.0 * share:.3g} %"
-                for signal, share in zip(self.plant.states, mistake.unexplained.tolist(), strict=True)
-                if math.isfinite(share)
-            )
-            rows.append(
-                f"  much less is unexplained if {mistake.mistake}: {shares}" if shares else f"  {mistake.mistake}"
-            )
-        rows += [f"  {doubt}" for doubt in self.doubts]
-        rows += [] if self.mistakes else ["  no mistake in the wiring explains the readings better"]
-        return "\n".join(rows)
+        for signal, moved, share, error in zip(self.plant.states, self.moved, *self.present, strict=True):
+            explained = f"{100.0 * share:.3g} % unexplained" if share.isfinite() else "it does not move"
+            rows.append(f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted to {error:.4g}; {explained}")
+        rows += [f"  mistake: {mistake}" for mistake in self.mistakes] or ["  no mistake explains the readings better"]
+        return "\n".join([*rows, *(f"  {doubt}" for doubt in self.doubts)])
 
     def require(self) -> None:
         """Refuse a system whose wiring does not fit, and warn of its doubts.
@@ -163,6 +151,7 @@ class Wiring(NamedTuple):
             warnings.warn(doubt, stacklevel=2)
 
 
+@torch.no_grad()
 def check_real_system(
     env: EnvBase,
     plant: Plant,
@@ -170,7 +159,6 @@ def check_real_system(
     *,
     policy: nn.Module | None = None,
     spread: float = 0.2,
-    seed: int = 0,
 ) -> Wiring:
     """Compare one-step predictions of the twin with readings over a few starts, and name what fits better.
 
@@ -185,180 +173,14 @@ def check_real_system(
         closure: closure of the twin, a first guess; None for one that the plant makes.
         policy: policy or controller that acts; None for commands around the middle of their ranges.
         spread: standard deviation of the noise, as a share of half the range of each action.
-        seed: seed of noise and first guess.
 
     Raises:
         WiringError: if a safety layer refuses every reading.
     """
-    generator = torch.Generator(device=env.device).manual_seed(seed)
+    generator, other = (torch.Generator(device=env.device).manual_seed(0) for _ in range(2))
     closure = plant.make_closure(generator) if closure is None else closure
-    return _checked(_fly(env, plant, _Middle(plant) if policy is None else policy, spread, generator), plant, closure)
-
-
-def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
-    """The same of a flight that has been flown, such as the first one of a training."""
-    return _checked(_rows(record, plant, ROWS), plant, closure)
-
-
-def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
-    """So many intervals of a record, if it has them, and all of the first ones."""
-    n = len(record.actions)
-    rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, count)).long()]).unique()
-    before = (rows - 1).clamp(min=0)
-    t = float(record.start) + plant.dt * rows.double()
-    states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
-    now, earlier = (actions[rows], exogenous[rows]), (actions[before], exogenous[before])
-    return Flown(t, states[rows], *now, states[rows + 1], *earlier)
-
-
-def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
-    plant = copy.deepcopy(plant).cpu()
-    fit = _Fit(plant, closure)
-    present, (moved, moves) = fit.suspicion("", flown), fit.movement(flown)
-    explained = not (present.unexplained > EXPLAINED).any()
-    stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
-    names = [signal.name for signal in plant.states]
-    wrong = [
-        f"the reading of state {name} stands still, and the twin moves"
-        for name, stands in zip(names, stuck, strict=True)
-        if stands
-    ]
-    wrong += [*_same_readings(plant, flown, explained), *_strange_inputs(plant, flown)]
-    unknown = torch.full_like(moved, torch.nan)
-    mistakes = [Suspicion(words, unknown, present.error) for words in wrong]
-    if not mistakes and not explained:
-        mistakes = _at_first(fit, flown) or _better(present, fit, flown)
-    return Wiring(plant, present, moved, tuple(mistakes), () if mistakes else tuple(_doubts(plant, present, flown)))
-
-
-def _doubts(plant: Plant, present: Suspicion, flown: Flown) -> Iterator[str]:
-    """What no mistake explains and may be right all the same."""
-    shares = zip(plant.states, present.unexplained.tolist(), strict=True)
-    if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
-        yield (
-            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, such as "
-            "a stop, or a mistake in a Reading, an Actuation or the plant's equations"
-        )
-    yield from _strange_starts(plant, flown)
-    yield from _moving_inputs(plant, flown)
-
-
-def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
-    """Which states have the readings of an input, or of another state if the twin does not move as they do."""
-    signals = [f"state {signal.name}" for signal in plant.states] + [f"input {signal.name}" for signal in plant.inputs]
-    readings = torch.cat([flown.states, flown.exogenous], -1)
-    for k, m in itertools.combinations(range(len(signals)), 2):
-        alike = torch.equal(readings[:, k], readings[:, m]) and bool((readings[:, k] != readings[0, k]).any())
-        if alike and k < len(plant.states) and not (explained and m < len(plant.states)):
-            yield f"{signals[k]} and {signals[m]} have the same readings"
-
-
-def _strange_starts(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which states are read at the start far outside what the plant draws, as from a wrong zero or other starts."""
-    drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
-    starts = flown.states[flown.t == 0.0]
-    for k, signal in enumerate(plant.states):
-        if len(starts) and _outside(drawn[:, k], starts[:, k], widths=0.5):
-            yield (
-                f"state {signal.name} is read at the start {_beside(signal, starts[:, k], drawn[:, k])}: a wrong zero, "
-                "or other starts than those that plans are made for"
-            )
-
-
-def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which inputs are read far outside what the plant draws, or at a small share of it."""
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
-    for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
-        if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
-            yield f"input {signal.name} is read {_beside(signal, read, course)}"
-
-
-def _moving_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which inputs are read to move within an episode, where the plant draws constant ones."""
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
-    constant, size = (drawn == drawn[:, :1]).all(1).all(0), drawn.abs().amax((0, 1))
-    moves = (flown.exogenous - flown.earlier_exogenous).abs().amax(0) > RESOLUTION * size
-    odd = constant & moves & (size > 0.0)  # an input that is always zero has no size
-    if names := [signal.name for signal, strange in zip(plant.inputs, odd, strict=True) if strange]:
-        yield (
-            f"the readings of input {', '.join(names)} move within an episode, where the plant draws constant ones: "
-            "noise of a sensor, what is read relative to something that moves, or other courses than those of plans"
-        )
-
-
-def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
-    """Readings beside draws in words."""
-    return (
-        f"between {read.min():.4g} and {read.max():.4g} {signal.unit}, where the plant draws {drawn.min():.4g} to "
-        f"{drawn.max():.4g}"
-    )
-
-
-def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:
-    """Whether readings lie beyond what is drawn by more than so many of its widths."""
-    low, high = course.min().item(), course.max().item()
-    width = high - low or max(abs(low), abs(high))
-    return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > widths * width
-
-
-def _at_first(fit: "_Fit", flown: Flown) -> list[Suspicion]:
-    """The mistakes that explain all movement in the first intervals of the flights, where the wiring as it is does not.
-
-    More coefficients than readings there would explain anything.
-    """
-    rows = flown.t < (EARLY - 0.5) * fit.plant.dt
-    early = Flown._make([*(column[rows] for column in flown[:7]), flown.ratio, flown.signs])
-    if early.ends.numel() <= len(fit.guess):
-        return []
-    present = fit.suspicion("", early)
-    if not (present.unexplained > EXPLAINED).any():
-        return []
-    return [mistake for mistake in _better(present, fit, early) if not (mistake.unexplained > EXPLAINED).any()]
-
-
-def _better(present: Suspicion, fit: "_Fit", flown: Flown) -> list[Suspicion]:
-    """The mistakes that fit much better than the wiring as it is, one of a kind.
-
-    A mistake in the reading of a state must leave at most half of that state, and others hardly more of any state than
-    the present wiring. Where no error of the present wiring shows beside the size of its state, a mistake must explain
-    all movement.
-    """
-    shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any()
-    enough = torch.where(present.unexplained > 2.0 * EXPLAINED, 0.5 * present.unexplained, EXPLAINED)
-    tried = []
-    ranked = sorted(_mistakes(fit.plant, flown), key=lambda pair: fit.suspicion(pair[0], pair[1], QUICK).score)
-    for words, mended in ranked[:FITTED]:
-        mistake = fit.suspicion(words, mended)
-        changed = (mended.states != flown.states).any(0)
-        limit = torch.where(changed, enough, WORSE * present.unexplained + EXPLAINED) if shows else EXPLAINED
-        if not (mistake.unexplained > limit).any():
-            tried.append(mistake)
-    tried.sort(key=lambda mistake: mistake.score)
-    kinds: dict[str, Suspicion] = {}
-    for mistake in tried:
-        if mistake.score < min(present.score, tried[0].score + 2.0 * MARGIN) - MARGIN:
-            kinds.setdefault(re.split(",| (?:is|are) in ", mistake.mistake)[0], mistake)
-    return list(kinds.values())
-
-
-class _Middle(nn.Module):
-    """Commands in the middle of the ranges of the actions."""
-
-    middle: Tensor
-
-    def __init__(self, plant: Plant):
-        super().__init__()
-        low, high = bounds(plant.actions)
-        self.register_buffer("middle", 0.5 * (low + high))
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """The middle."""
-        return self.middle.expand(*observation.shape[:-1], -1)
-
-
-@torch.no_grad()
-def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator: torch.Generator) -> Flown:
-    """The sound intervals of a few short flights."""
+    if policy is None:
+        policy = SaturatedAffine(len(plant.observations), plant.actions, weight_scale=0.0, generator=other)
     noise = ExplorationConfig(spread=spread, correlation_time=CORRELATION * plant.dt)
     live = LivePolicy(plant, policy, noise, generator=generator).to(env.device)
     act = TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
@@ -377,7 +199,120 @@ def _fly(env: EnvBase, plant: Plant, policy: nn.Module, spread: float, generator
         env.load_state_dict(kept)
     if not parts:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    return Flown._make([*(torch.cat(columns) for columns in list(zip(*parts, strict=True))[:7]), 1.0, 1.0])
+    columns: list[Any] = [torch.cat(column) for column in list(zip(*parts, strict=True))[:6]]
+    return _checked(Flown(*columns), plant, closure)
+
+
+def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
+    """The same of a flight that has been flown, such as the first one of a training."""
+    return _checked(_rows(record, plant, ROWS), plant, closure)
+
+
+def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
+    """So many intervals of a record, if it has them, and all of the first ones."""
+    n = len(record.actions)
+    rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, count)).long()]).unique()
+    t = float(record.start) + plant.dt * rows.double()
+    states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
+    return Flown(t, states[rows], actions[rows], exogenous[rows], states[rows + 1], actions[(rows - 1).clamp(min=0)])
+
+
+def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
+    fit = _Fit(copy.deepcopy(plant).cpu(), closure)
+    present, (moved, moves) = fit.unexplained(flown), fit.movement(flown)
+    explained = not (present.share > EXPLAINED).any()
+    stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
+    mistakes = [
+        f"the reading of state {signal.name} stands still, and the twin moves"
+        for signal, stands in zip(plant.states, stuck, strict=True)
+        if stands
+    ]
+    mistakes += [*_same_readings(plant, flown, explained), *_strange_inputs(plant, flown)]
+    if not mistakes and not explained:
+        early = flown.t < (EARLY - 0.5) * plant.dt
+        first = flown._replace(**{name: getattr(flown, name)[early] for name in Flown._fields[:6]})
+        # More coefficients than readings would explain anything.
+        mistakes = _better(fit, first, wholly=True) if first.ends.numel() > len(fit.guess) else []
+        mistakes = mistakes or _better(fit, flown)
+    return Wiring(plant, moved, present, tuple(mistakes), () if mistakes else tuple(_doubts(plant, present, flown)))
+
+
+def _doubts(plant: Plant, present: Unexplained, flown: Flown) -> Iterator[str]:
+    """What no mistake explains and may be right all the same."""
+    shares = zip(plant.states, present.share.tolist(), strict=True)
+    if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
+        yield (
+            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, such as "
+            "a stop, or a mistake in a Reading, an Actuation or the plant's equations"
+        )
+    drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
+    for signal, draws, read in zip(plant.states, drawn.T, flown.states[flown.t == 0.0].T, strict=True):
+        if len(read) and _outside(draws, read, widths=0.5):
+            yield (
+                f"state {signal.name} is read at the start {_beside(signal, read, draws)}: a wrong zero, or other "
+                "starts than those that plans are made for"
+            )
+
+
+def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
+    """Which states have the readings of an input, or of another state if the twin does not move as they do."""
+    signals = [f"state {signal.name}" for signal in plant.states] + [f"input {signal.name}" for signal in plant.inputs]
+    readings = torch.cat([flown.states, flown.exogenous], -1)
+    for k, m in itertools.combinations(range(len(signals)), 2):
+        alike = torch.equal(readings[:, k], readings[:, m]) and bool((readings[:, k] != readings[0, k]).any())
+        if alike and k < len(plant.states) and not (explained and m < len(plant.states)):
+            yield f"{signals[k]} and {signals[m]} have the same readings"
+
+
+def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
+    """Which inputs are read far outside what the plant draws, or at a small share of it."""
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
+    for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
+        if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
+            yield f"input {signal.name} is read {_beside(signal, read, course)}"
+
+
+def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
+    """Readings beside draws in words."""
+    return (
+        f"between {read.min():.4g} and {read.max():.4g} {signal.unit}, where the plant draws {drawn.min():.4g} to "
+        f"{drawn.max():.4g}"
+    )
+
+
+def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:
+    """Whether readings lie beyond what is drawn by more than so many of its widths."""
+    low, high = course.min().item(), course.max().item()
+    width = high - low or max(abs(low), abs(high))
+    return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > widths * width
+
+
+def _better(fit: "_Fit", flown: Flown, *, wholly: bool = False) -> list[str]:
+    """The mistakes that fit much better than the wiring as it is, one of a kind.
+
+    A mistake in the reading of a state must leave at most half of that state, and others hardly more of any state than
+    the present wiring. Where no error of the present wiring shows beside the size of its state, or with ``wholly``, a
+    mistake must explain all movement.
+    """
+    present = fit.unexplained(flown)
+    if not (present.share > EXPLAINED).any():
+        return []
+    shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any() and not wholly
+    enough = torch.where(present.share > 2.0 * EXPLAINED, 0.5 * present.share, EXPLAINED)
+    tried = []
+    ranked = sorted(_mistakes(fit.plant, flown), key=lambda pair: fit.unexplained(pair[1], QUICK).score)
+    for words, mended in ranked[:FITTED]:
+        left = fit.unexplained(mended)
+        changed = (mended.states != flown.states).any(0)
+        limit = torch.where(changed, enough, WORSE * present.share + EXPLAINED) if shows else EXPLAINED
+        if not (left.share > limit).any():
+            tried.append((left.score, words))
+    tried.sort(key=lambda pair: pair[0])
+    kinds: dict[str, str] = {}
+    for score, words in tried:
+        if score < min(present.score, tried[0][0] + 2.0 * MARGIN) - MARGIN:
+            kinds.setdefault(re.split(",| (?:is|are) in ", words)[0], words)
+    return list(kinds.values())
 
 
 class _Fit:
@@ -394,13 +329,12 @@ class _Fit:
         self._weights = [weight for weight in self._closure.parameters() if weight.requires_grad]
         self.guess = torch.cat([torch.zeros(0).double(), *(weight.detach().flatten() for weight in self._weights)])
 
-    def suspicion(self, mistake: str, flown: Flown, evaluations: int = EVALUATIONS) -> Suspicion:
-        """A wiring with the coefficients that fit it best after so many evaluations."""
+    def unexplained(self, flown: Flown, evaluations: int = EVALUATIONS) -> Unexplained:
+        """What is left with the coefficients that fit best after so many evaluations."""
         weights = self._fitted(flown, evaluations) if self._weights else self.guess
-        errors = self._errors(flown, weights)[0]
-        error, (size, moves) = errors.square().mean(0), self.movement(flown)
+        error, (size, moves) = self._errors(flown, weights)[0].square().mean(0), self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
-        return Suspicion(mistake, share, error.sqrt())
+        return Unexplained(share, error.sqrt())
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
@@ -445,24 +379,21 @@ class _Fit:
 
 
 def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
-    """Flights as they would be with each mistake mended, and the mistake in words."""
-    states, actions, inputs = plant.states, plant.actions, plant.inputs
-    yield from _signal_mistakes("state", states, flown, ("states", "ends"), FACTORS, [s.unit for s in states])
-    yield from _signal_mistakes("action", actions, flown, ("actions",), (), [""] * len(actions))
-    yield from _signal_mistakes("input", inputs, flown, ("exogenous",), FACTORS, [s.name for s in inputs])
+    """Mistakes in words, and the flights as they would be with each one mended."""
+    yield from _signal_mistakes("state", plant.states, flown, ("states", "ends"), FACTORS)
+    yield from _signal_mistakes("action", plant.actions, flown, ("actions",), ())
+    yield from _signal_mistakes("input", plant.inputs, flown, ("exogenous",), FACTORS)
     for unit in ("rad", "deg"):
         (other, scale, _), *_ = OTHER_UNITS[unit]
-        columns = [k for k, signal in enumerate(states) if signal.unit in (unit, f"{unit}/s")]
-        if len({states[k].unit for k in columns}) == 2:
+        columns = [k for k, signal in enumerate(plant.states) if signal.unit in (unit, f"{unit}/s")]
+        if len({plant.states[k].unit for k in columns}) == 2:
             turned = _changed(flown, ("states", "ends"), columns, scale, 0.0)
             yield f"all states in {unit} and {unit}/s are in {other} and {other}/s", turned
     for signal, signs in zip(plant.states, 1.0 - 2.0 * torch.eye(len(plant.states)).double(), strict=True):
-        yield f"the equation of state {signal.name} has the other sign", flown._replace(signs=signs)
+        yield f"the equation of state {signal.name} is negated", flown._replace(signs=signs)
     for ratio in RATIOS:
         yield f"dt is another one, {ratio * plant.dt:g} s and not {plant.dt:g} s", flown._replace(ratio=ratio)
     yield "an action acts one interval late", flown._replace(actions=flown.earlier_actions)
-    if plant.inputs:
-        yield "an input is read one interval late", flown._replace(exogenous=flown.earlier_exogenous)
     for k, signal in enumerate(plant.actions):
         if signal.low != -signal.high:
             mirrored = _changed(flown, ("actions",), [k], -1.0, signal.low + signal.high)
@@ -474,41 +405,32 @@ def _mistakes(plant: Plant, flown: Flown) -> Iterator[tuple[str, Flown]]:
 
 
 def _signal_mistakes(
-    what: str,
-    signals: Sequence[Signal],
-    flown: Flown,
-    names: tuple[str, ...],
-    factors: Sequence[float],
-    kinds: Sequence[str],
+    what: str, signals: Sequence[Signal], flown: Flown, names: tuple[str, ...], factors: Sequence[float]
 ) -> Iterator[tuple[str, Flown]]:
-    """The signs, units and orders of signals, whose values the flights hold under the names; those of a kind together.
+    """The signs, units and orders of signals, whose values the flights hold under the names.
 
-    Signals of a kind may have one mistake together; the unit of an empty kind is none.
+    All signals of a unit may have one mistake together.
     """
-    groups = [(f"{what} {signal.name}", "has", "is", signal.unit, [k]) for k, signal in enumerate(signals)]
-    for kind in dict.fromkeys(kinds):
-        columns = [k for k, other in enumerate(kinds) if other == kind]
-        if len(columns) > 1:
-            groups.append((f"all {what}s{f' in {kind}' if kind else ''}", "have", "are", kind, columns))
-    for subject, has, are, unit, columns in groups:
-        yield f"{subject} {has} the other sign", _changed(flown, names, columns, -1.0, 0.0)
-        for words, scale, offset in _units(unit, factors):
-            yield f"{subject} {are} {words}", _changed(flown, names, columns, scale, offset)
+    groups = [(f"{what} {signal.name} is", signal.unit, [k]) for k, signal in enumerate(signals)]
+    units = [signal.unit for signal in signals]
+    for unit in dict.fromkeys(units):
+        columns = [k for k, other in enumerate(units) if other == unit]
+        groups += [(f"all {what}s in {unit} are", unit, columns)] if len(columns) > 1 else []
+    for subject, unit, columns in groups:
+        yield f"{subject} negated", _changed(flown, names, columns, -1.0, 0.0)
+        others = OTHER_UNITS.get(unit, ())
+        for other, scale, offset in others:
+            words = f"{subject} in {other}, where the plant has {unit}"
+            yield words, _changed(flown, names, columns, scale, offset)
+        for factor in factors:
+            if all(not 0.5 < factor / scale < 2.0 for _, scale, _ in others):
+                words = f"{subject} read {1.0 / factor:g} times as large as it is"
+                yield words, _changed(flown, names, columns, factor, 0.0)
     for k, m in itertools.combinations(range(len(signals)), 2):
         order = list(range(len(signals)))
         order[k], order[m] = m, k
         swapped = {name: getattr(flown, name)[:, order] for name in names}
         yield f"{what}s {signals[k].name} and {signals[m].name} are in the other order", flown._replace(**swapped)
-
-
-def _units(unit: str, factors: Sequence[float]) -> Iterator[tuple[str, float, float]]:
-    """In which other unit, or how many times too large, a value may come: words, size and zero."""
-    others = OTHER_UNITS.get(unit, ())
-    for other, scale, offset in others:
-        yield f"in {other}, where the plant has {unit}", scale, offset
-    for factor in factors:
-        if all(not 0.5 < factor / scale < 2.0 for _, scale, _ in others):
-            yield f"read {1.0 / factor:g} times as large as it is", factor, 0.0
 
 
 def _changed(flown: Flown, names: tuple[str, ...], columns: list[int], scale: float, offset: float) -> Flown:

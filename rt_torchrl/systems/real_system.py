@@ -65,14 +65,11 @@ class Reading:
                 not finite.
         """
         names = [signal.name for signal in signals]
-        missing = [key for key in self.keys if reported.get(key, None) is None]
-        if missing:
+        if wrong := [key for key in self.keys if not isinstance(reported.get(key, None), Tensor)]:
             known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
-            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
-        if tuples := [key for key in self.keys if reported.get(key).is_nested]:
             raise ValueError(
-                f"{what} is read from {tuples}, in which the environment reports a tuple of arrays; flatten it first, "
-                "such as GymWrapper(gymnasium.wrappers.FlattenObservation(env))."
+                f"{what} is read from {wrong}, which the environment does not report as an array; it has {known}. A "
+                "tuple is flattened first, such as by GymWrapper(gymnasium.wrappers.FlattenObservation(env))."
             )
         vector = self.of(*(reported.get(key).double() for key in self.keys))
         if tuple(vector.shape) != (*reported.batch_size, len(signals)):
@@ -110,9 +107,7 @@ class Actuation:
 
     def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """The environment's action for a command in the plant's units."""
-        scale, offset = (
-            torch.as_tensor(x, dtype=torch.float64, device=command.device) for x in (self.scale, self.offset)
-        )
+        scale, offset = (torch.as_tensor(x).to(command) for x in (self.scale, self.offset))
         return (command - offset) / scale
 
 
@@ -178,8 +173,8 @@ class RealSystem(EnvBase):
     Raises:
         ValueError: if ``env`` is not a TorchRL environment or is a batch of systems, an entry is missing or misshapen,
             a constant input is not finite, the plant has states that no sensor reads, the environment's range of an
-            action does not contain the plant's, or its time limit is shorter than the plant's horizon; in a step, if an
-            entry that is read is not reported, or the environment ends the episode where the plant does not.
+            action does not contain the plant's; in a step, if an entry that is read is not reported, or the environment
+            ends the episode where the plant does not.
     """
 
     observation_spec: Composite
@@ -216,18 +211,9 @@ class RealSystem(EnvBase):
         if not isinstance(self._exogenous, Reading):
             require_numbers("real system", exogenous=self._exogenous)
         self._seed, self._episodes = seed, 0
-        declare_specs(self, plant)
-        self._declare_refusals()
+        self._judged = isinstance(env.full_observation_spec.get("refused", None), Binary)  # by a safety layer
+        declare_specs(self, plant, refused=self._judged)
         self._require_fit()
-
-    def _declare_refusals(self) -> None:
-        """Declare the entry ``refused`` where a safety layer behind this system has one."""
-        declared = self.env.full_observation_spec.get("refused", None)
-        self._judged = isinstance(declared, Binary)
-        if self._judged:
-            observed = self.observation_spec.clone()
-            observed["refused"] = Binary(n=1, shape=(1, 1), dtype=torch.bool, device=self.device)
-            self.observation_spec = observed
 
     def _require_fit(self) -> None:
         """Refuse, before the first step and without moving anything real, an environment that would fail in it."""
@@ -244,7 +230,6 @@ class RealSystem(EnvBase):
                 "the environment reports the action that it has applied, as a safety layer does, but no reading reads "
                 'it: give applied=Reading(keys=("applied",)), in the plant\'s units.'
             )
-        self._require_time()
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
             raise ValueError(
@@ -255,16 +240,6 @@ class RealSystem(EnvBase):
             raise ValueError(f"the environment's action is {spec}; the plant needs continuous ones for {names}.")
         if isinstance(spec, Bounded):
             self._require_range(spec)
-
-    def _require_time(self) -> None:
-        """Refuse a time limit of Gymnasium below the horizon; other early ends are found only when they happen."""
-        limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)
-        if limit is not None and limit < self.plant.n_steps:
-            raise ValueError(
-                f"the environment truncates an episode after {limit} of the {self.plant.n_steps} control intervals of "
-                f"plant {self.plant.name!r}; use a horizon of at most {limit * self.plant.dt:g} s, or make the "
-                "environment with a greater max_episode_steps."
-            )
 
     def _require_range(self, spec: Bounded) -> None:
         bounds = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
@@ -301,16 +276,18 @@ class RealSystem(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         # The seed counts episodes, not resets: a reset need not be followed by a step.
-        seed = None if self._seed is None else episode_seed(self._seed, self._episodes)
-        gymnasium = any(isinstance(layer, GymWrapper) for layer in layers(self.env))
-        in_reset = seed is not None and gymnasium  # whose set_seed would reset once more
-        if seed is not None and not in_reset:
-            self.env.set_seed(seed, static_seed=True)
-        self._reported, self._step_count = self.env.reset(**({"seed": seed} if in_reset else {})), 0
-        measured = self._measured(self._reported)
+        options = {}
+        if self._seed is not None:
+            seed = episode_seed(self._seed, self._episodes)
+            if any(isinstance(layer, GymWrapper) for layer in layers(self.env)):  # whose set_seed would reset once more
+                options = {"seed": seed}
+            else:
+                self.env.set_seed(seed, static_seed=True)
+        self._reported, self._step_count = self.env.reset(**options), 0
         if self._controller is not None:
+            measured = self._measured(self._reported)
             self._memory = self._controller.start(measured.cpu(), self._input(self._reported).cpu())
-        return self._begun(measured)
+        return self._begun()
 
     @property
     def pace(self) -> Any:
@@ -323,11 +300,11 @@ class RealSystem(EnvBase):
             if isinstance(layer, AroundSystem):
                 layer.begin_window()
         self._step_count = 0
-        return self._begun(self._measured(self._reported))
+        return self._begun()
 
-    def _begun(self, measured: Tensor) -> TensorDict:
+    def _begun(self) -> TensorDict:
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        return self._entries(self._reported, self._joined(measured), applied, ended=False)
+        return self._entries(self._reported, self._joined(self._reported), applied, ended=False)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -343,15 +320,15 @@ class RealSystem(EnvBase):
         else:
             applied = self._applied.read(stepped["next"], self.plant.actions, "applied").to(self.device)
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
-        measured = self._measured(stepped["next"])
         if self._controller is not None:
-            interval = t, self._memory, state[:, self._controller.measured], exogenous, applied, measured
+            known, measured = state[:, self._controller.measured], self._measured(stepped["next"])
+            interval = t, self._memory, known, exogenous, applied, measured
             self._memory = self._controller.advance(*(values.cpu() for values in interval))
-        end = self._joined(measured)
+        end = self._joined(stepped["next"])
         over = self.plant.end_cost is not None and bool(self.plant.ended(end).any())
         last = self._step_count >= self.plant.n_steps and not over
         if stepped["next", "done"].any() and not (last or over):
-            raise ended_early(stepped["next"], self._step_count, self.plant)
+            raise ended_early(self._step_count, self.plant)
         if (last or over) and hasattr(innermost(self.env), "end_episode"):
             innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
@@ -367,8 +344,9 @@ class RealSystem(EnvBase):
         """The states that the environment reports."""
         return self._state.read(reported, self._read, "state")
 
-    def _joined(self, measured: Tensor) -> Float[Tensor, "1 n_s"]:
+    def _joined(self, reported: TensorDictBase) -> Float[Tensor, "1 n_s"]:
         """The plant's state, of what the environment reports and what the controller has computed."""
+        measured = self._measured(reported)
         if self._controller is not None:
             measured = self._controller.joined(measured.cpu(), self._memory)
         return measured.to(self.device)

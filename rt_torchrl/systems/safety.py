@@ -3,10 +3,10 @@
 import json
 import math
 import time
-from collections import Counter
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool
@@ -55,13 +55,12 @@ class SafetyEvent(NamedTuple):
 
 @dataclass
 class SafetyReport:
-    """Events of one episode, the number of intervals in which each reason occurred, and where readings are wrong.
+    """Events of one episode, and where readings are wrong.
 
     ``wrong`` holds the intervals at whose end the observation is wrong, also those of which this became known later.
     """
 
     events: list[SafetyEvent] = field(default_factory=list)
-    counts: Counter[str] = field(default_factory=Counter)
     wrong: set[int] = field(default_factory=set)
 
 
@@ -101,16 +100,16 @@ class ActionLimits:
             raise ValueError(f"{argument}={values} must have {self.spec.shape[-1]} numbers, one for each action.")
         return action.expand(self.spec.shape)
 
-    def sendable(self, argument: str, values: Sequence[float]) -> Tensor:
-        """The action of these values, which must lie in the range, so that it is sent without a change.
+    def sendable(self, fallback: Sequence[float]) -> Tensor:
+        """The action of a constant fallback, which must lie in the range, so that it is sent without a change.
 
         Raises:
             ValueError: if the values are too many or too few, one is not finite, or one lies outside the range.
         """
-        action = self.constant(argument, values)
+        action = self.constant("fallback", fallback)
         if not ((action >= self.low) & (action <= self.high) & action.isfinite()).all():
             raise ValueError(
-                f"{argument}={values} must lie in the range of the actions, {self.low.flatten().tolist()} to "
+                f"fallback={fallback} must lie in the range of the actions, {self.low.flatten().tolist()} to "
                 f"{self.high.flatten().tolist()}; the machine gets nothing outside it."
             )
         return action
@@ -129,7 +128,8 @@ class ActionLimits:
         # The rate must not lead out of the range, even if the last action was outside it.
         sent = torch.minimum(torch.maximum(reached, self.low), self.high)
         held = {"range": (inside != action) | (sent != reached), "rate": reached != inside}
-        return sent, {name: _components(mask) for name, mask in held.items() if mask.any()}
+        places = {name: mask.flatten().nonzero().flatten().tolist() for name, mask in held.items() if mask.any()}
+        return sent, {name: f"action {', '.join(map(str, found))}" for name, found in places.items()}
 
 
 class Watchdog:
@@ -163,17 +163,14 @@ class Watchdog:
             elapsed: wall-clock time that the observation took to come [s].
         """
         faults: dict[str, str] = {}
-        broken = [name for name, value in entries.items() if not value.isfinite().all()]
-        if broken:
+        if broken := [name for name, value in entries.items() if not value.isfinite().all()]:
             faults["not finite"] = ", ".join(broken)
         for kind, ranges in (("out of range", self.config.ranges), ("limit", self.config.limits)):
-            outside = [name for name, ends in ranges.items() if name in entries and not _inside(entries[name], ends)]
-            if outside:
+            if outside := [name for name in ranges if name in entries and _outside(entries[name], ranges[name]).any()]:
                 faults[kind] = ", ".join(outside)
         self.stale = 0
         for entry, limit in self.config.frozen.items():
-            count = self._equal(entry, entries[entry], torch.as_tensor(limit)) if entry in entries else 0
-            if count:
+            if entry in entries and (count := self._equal(entry, entries[entry], torch.as_tensor(limit))):
                 faults["frozen"] = f"{entry}, {count} equal readings"
                 self.stale = max(self.stale, count - 2)
         if elapsed > self.config.deadline:
@@ -222,10 +219,9 @@ class SafetyLayer(AroundSystem):
     Args:
         env: environment of one real system, with batch size () or (1,).
         config: limits on actions and observations.
-        fallback: action within the range; a controller of a plant, where ``state`` and ``exogenous`` are observed; or a
-            function that makes an action from the TensorDict of the last observation. One with a method ``begin`` has a
-            memory: ``begin`` is called at every reset, and the controller in every interval, so that its memory goes on
-            while the policy acts and its action is not used.
+        fallback: action within the range; a function that makes an action from the TensorDict of the last observation;
+            or state feedback, where ``state`` and ``exogenous`` are observed. It is asked in every interval, so that
+            its memory goes on while the policy acts and its action is not used.
         clock: wall clock [s].
 
     Raises:
@@ -260,14 +256,11 @@ class SafetyLayer(AroundSystem):
         self.report, self._episodes = SafetyReport(), 0
         """Report of the present episode; between two episodes, that of the last one."""
         self._good: dict[str, Tensor] = {}
-        self._unwritten: OSError | None = None
         self._make_specs()
         self.watchdog, self.limits = Watchdog(config), ActionLimits(env.action_spec, config)
-        self._fallback: Tensor | Callable[[TensorDictBase], Tensor] | StateFeedback
-        if isinstance(fallback, StateFeedback) or callable(fallback):
-            self._fallback = fallback
-        else:
-            self._fallback = self.limits.sendable("fallback", fallback)
+        self._fallback: Any = fallback
+        if not (isinstance(fallback, StateFeedback) or callable(fallback)):
+            self._fallback = self.limits.sendable(fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
             config.log.touch()
@@ -275,8 +268,7 @@ class SafetyLayer(AroundSystem):
     def _make_specs(self) -> None:
         observation, action = self.env.full_observation_spec.clone(), self.env.action_spec
         for argument in ("ranges", "limits", "frozen"):
-            unknown = set(getattr(self.config, argument)) - set(observation.keys())
-            if unknown:
+            if unknown := set(getattr(self.config, argument)) - set(observation.keys()):
                 raise ValueError(f"{argument} has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
         if "applied" not in observation:
             observation["applied"] = Unbounded(shape=action.shape, dtype=action.dtype, device=self.device)
@@ -287,25 +279,21 @@ class SafetyLayer(AroundSystem):
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if self._unwritten is not None:
-            error, self._unwritten = self._unwritten, None
-            raise error  # now that nothing moves; in the episode the system came first
         reading = self.env.reset(**kwargs)
         self.watchdog.begin()
-        if hasattr(self._fallback, "begin"):
+        if isinstance(self._fallback, StateFeedback):
             self._fallback.begin()
         faults = self._faults(reading, 0.0)
         if faults.pop("limit", None):
             self.watchdog.note(0.0, True)  # the fallback begins
         if faults:
-            read = {key: reading[key].flatten().tolist() for key in self._watched if key in reading}
-            raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
+            raise ValueError(f"the system begins with a fault, {faults}, and nothing was sent to it: {dict(reading)}.")
         self._step_count, self._passed, self._last, self._good = 0, 0, None, {}
         if getattr(innermost(self.env), "reads_applied", False):
             self._last = reading["applied"].clone()  # of a machine in operation
         reading = self._remember(reading)
         if "applied" not in reading:  # the machine need not say what it has applied
-            reading["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
+            reading["applied"] = self.action_spec.zero()
         reading["tripped"], reading["refused"] = self._flag(self.watchdog.tripped(0.0)), self._flag(False)
         return reading
 
@@ -346,14 +334,13 @@ class SafetyLayer(AroundSystem):
             self.watchdog.note(t, True)
         tripped = self.watchdog.tripped(t)
         other = self._fallback
-        if isinstance(other, StateFeedback):  # whose clock begins anew in each window
+        if isinstance(other, StateFeedback):  # which remembers also while it does not act; a window has its own clock
             clock = self._step_count * self.config.interval
             other = other.act(clock, tensordict["state"], tensordict["exogenous"])
-        elif callable(other) and (tripped or hasattr(other, "begin")):
+        elif tripped and callable(other):
             other = other(tensordict)
         if tripped:
-            action = cast(Tensor, other)
-            reasons["fallback"] = "watchdog tripped"
+            action, reasons["fallback"] = other, "watchdog tripped"
             if action.shape != self.action_spec.shape or not action.isfinite().all():
                 raise ValueError(
                     f"fallback gave {action} at t = {t:g} s; it must be finite, of shape {self.action_spec.shape}."
@@ -363,9 +350,10 @@ class SafetyLayer(AroundSystem):
 
     def _faults(self, reading: TensorDictBase, elapsed: float) -> dict[str, str]:
         """Faults of an observation by kind, each with a detail."""
-        missing = [key for key in self._watched if key not in reading]
-        faults = {"missing": f"{', '.join(missing)}, which the system declares to observe"} if missing else {}
-        faults |= self.watchdog.faults({key: reading[key] for key in self._watched if key in reading}, elapsed)
+        read = {key: reading[key] for key in self._watched if key in reading}
+        faults = self.watchdog.faults(read, elapsed)
+        if missing := [key for key in self._watched if key not in read]:
+            faults["missing"] = ", ".join(missing)
         reasons: dict[str, str] = getattr(innermost(self.env), "reasons", {})  # of a machine that says why
         if reasons and "not finite" in faults:
             faults["not finite"] += f" ({'; '.join(f'{tag}: {why}' for tag, why in reasons.items())})"
@@ -387,22 +375,20 @@ class SafetyLayer(AroundSystem):
         t = self._step_count * self.config.interval
         event = SafetyEvent(self._episodes, self._step_count, t, reasons, command, sent, time.time())
         self.report.events.append(event)
-        self.report.counts.update(reasons.keys())
-        if self.config.log is not None and self._unwritten is None:
+        if self.config.log is not None:
             try:
                 with self.config.log.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(finite(event._asdict())) + "\n")
-            except OSError as error:
-                # A full disk must not stop the control of a machine that moves.
-                self._unwritten = error
+            except OSError as error:  # such as a full disk, which must not stop the control of a machine that moves
+                warnings.warn(f"events are missing in {self.config.log}: {error}", stacklevel=2)
 
     def _flag(self, value: bool) -> Tensor:
         return torch.full((*self.batch_size, 1), value, dtype=torch.bool, device=self.device)
 
 
-def layer_of(env: EnvBase) -> SafetyLayer | None:
-    """The safety layer of a real system; None if there is none."""
-    return next((layer for layer in layers(env) if isinstance(layer, SafetyLayer)), None)
+def report_of(env: EnvBase) -> SafetyReport | None:
+    """The report of the safety layer of a real system about its last episode; None if there is none."""
+    return next((layer.report for layer in layers(env) if isinstance(layer, SafetyLayer)), None)
 
 
 class OperatingLimits:
@@ -437,11 +423,8 @@ class OperatingLimits:
         states, actions = flown.states[..., 1:, : self._read], flown.actions
         steps = torch.cat([torch.zeros_like(actions[..., :1, :]), actions.diff(dim=-2)], -2).abs()
         greatest = self._dt * actions.new_tensor(self.rates) * (1.0 + ROUNDING)
-        return {
-            "states": _outside(states, self.states),
-            "actions": _outside(actions, self.actions),
-            "rates": (steps > greatest).any(-1),
-        }
+        beyond = {"states": _outside(states, self.states), "actions": _outside(actions, self.actions)}
+        return {kind: signals.any(-1) for kind, signals in (beyond | {"rates": steps > greatest}).items()}
 
     def safety(self) -> dict[str, Any]:
         """Options of a :class:`SafetyConfig` that hold these limits on a system in the plant's own units."""
@@ -455,27 +438,17 @@ def require_layer(env: EnvBase) -> None:
     Raises:
         ValueError: if there is none.
     """
-    if layer_of(env) is None:
+    if report_of(env) is None:
         raise ValueError(
             "limits are given, and the real system has no safety layer that holds them: put a SafetyLayer around the "
             "environment, with SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())."
         )
 
 
-def _components(mask: Tensor) -> str:
-    """The components of an action that a mask marks, in words."""
-    return "action " + ", ".join(map(str, mask.flatten().nonzero().flatten().tolist()))
-
-
-def _inside(value: Tensor, ends: Range) -> bool:
-    low, high = (torch.as_tensor(end, dtype=value.dtype, device=value.device) for end in ends)
-    # A value that is not finite is a fault of its own.
-    return bool(((value >= low) & (value <= high) | ~value.isfinite()).all())
-
-
-def _outside(values: Tensor, ends: Ends) -> Bool[Tensor, "*batch n"]:
-    low, high = (values.new_tensor(end) for end in ends)
-    return ~((values >= low) & (values <= high)).all(-1)
+def _outside(values: Tensor, ends: Range) -> Bool[Tensor, "*batch n"]:
+    """Where values lie beyond their ends; NaN is a fault of its own."""
+    low, high = (torch.as_tensor(end, dtype=values.dtype, device=values.device) for end in ends)
+    return (values < low) | (values > high)
 
 
 def _ends(signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:

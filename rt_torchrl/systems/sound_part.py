@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Bool
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.safety import SafetyReport, layer_of
+from rt_torchrl.systems.safety import SafetyReport
 
 GREATEST = torch.finfo(torch.float32).max
 """Greatest number to be learned from: the long-term memory keeps its priorities in single precision."""
@@ -105,12 +104,6 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     whole = (n == plant.n_steps or over) and all(sound)
     parts = list(zip(starts, ends, strict=True))
     return SoundPart(parts, _reported(report) + overflows, "; ".join(reasons), whole)
-
-
-def report_of(env: EnvBase) -> SafetyReport | None:
-    """The report of the safety layer of a real system about its last episode; None if there is none."""
-    layer = layer_of(env)
-    return None if layer is None else layer.report
 
 
 def _overflows(episode: TensorDictBase, dt: float) -> tuple[Bool[Tensor, " n"], list[Fault]]:

@@ -10,7 +10,6 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from rt_torchrl.options import require_range
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import ForeignSystem
 from rt_torchrl.systems.operation import Pace
@@ -23,10 +22,12 @@ EARLIER = 0.01
 """Share of the period by which the next look comes earlier where the sample was there at once; it keeps the phase."""
 TOLERATED = 4
 """Number of late answers in a row after which a connection counts as lost."""
+PATIENCE = 60.0
+"""Time for which a reset waits for the plant to answer [s]."""
 AGAIN = 0.05
 """Time between two attempts to connect [s]."""
-LONGEST = 60.0
-"""Longest time of an answer for which any control loop waits [s]."""
+LONGEST = 1e-4, 60.0
+"""Least and greatest time for which a control loop may wait for an answer [s]."""
 
 
 class LinkLostError(OSError):
@@ -44,25 +45,18 @@ class RefusedRequestError(ValueError):
     """
 
 
-def require_timeout(timeout: float) -> None:
-    """Refuse a longest time of an answer [s] that no control loop waits for.
-
-    Raises:
-        ValueError: if it is not positive, or longer than ``LONGEST``.
-    """
-    require_range("timeout", timeout, 0.0, LONGEST, unit="s", of="the link")
-    if timeout == 0.0:
-        raise ValueError(f"timeout={timeout} s of the link must be positive.")
-
-
 @runtime_checkable
 class Link(Protocol):
     """A connection to a plant's control system. A tag is a named number there.
 
     All methods but ``connect`` answer within a fraction of the control period, or raise. A tag that the control system
-    marks as not good is NaN; a link may say why in an attribute ``quality``, a text for each tag of the last reading
-    that is not good.
+    marks as not good is NaN.
+
+    Attributes:
+        quality: a text for each tag of the last reading that is not good.
     """
+
+    quality: Mapping[str, str]
 
     def connect(self) -> None:
         """Connect, or connect again.
@@ -106,9 +100,7 @@ class ConnectedPlant(ForeignSystem):
     The plant must have a watchdog of its own, which brings its safe action when commands stay out. A thread connects
     again, so that the pace is kept.
 
-    The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
-    readings of a plant that answered and had no new sample, and ``skipped`` all samples of episodes that nobody read.
-    The attribute ``reasons`` says for the tags of the last reading that are NaN, or for all of them, why they are.
+    The attribute ``losses`` counts lost connections; ``reasons`` says why tags of the last reading are NaN.
 
     Args:
         link: connection to the plant.
@@ -118,7 +110,6 @@ class ConnectedPlant(ForeignSystem):
         period: control period of the plant [s].
         sample: tag that counts the samples; None if the plant has none, and then the client's own clock counts.
         answered: tag that takes the number of the sample that a command answers; None if the plant has none.
-        patience: time for which a reset waits for the plant to answer [s].
         clock: wall clock [s].
         sleep: function that waits for some time [s].
 
@@ -138,7 +129,6 @@ class ConnectedPlant(ForeignSystem):
         period: float,
         sample: str | None = None,
         answered: str | None = None,
-        patience: float = 60.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
@@ -147,27 +137,24 @@ class ConnectedPlant(ForeignSystem):
                 f"entries={list(entries)} must not be empty, and commands={list(commands)} must be one tag for each of "
                 f"the actions {[action.name for action in actions]}."
             )
-        if not patience > 0.0:
-            raise ValueError(f"patience={patience} s must be positive; infinity waits for ever.")
         if answered is not None and sample is None:
             raise ValueError(f"answered={answered!r} takes the number of a sample; name the tag that counts, sample.")
         super().__init__({key: len(tags) for key, tags in entries.items()} | {"skipped": 1}, actions)
         self.link, self.pace = link, Pace(period, clock=clock, sleep=sleep)
         self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
         self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
-        self._patience, self._clock, self._sleep = patience, clock, sleep
+        self._clock, self._sleep = clock, sleep
         self.reads_applied = "applied" in entries
         """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
-        self.losses = self.late = self.stale = self.skipped = 0
-        self._in_a_row = self._gap = 0
+        self.losses = self._in_a_row = self._gap = 0
         self._sample, self._connected, self._closing = -math.inf, False, False
         self.reasons: dict[str, str] = {}
-        self._lost = ""  # why the last request failed
+        self._lost = "no new sample"  # why the last request failed
         self._connecting: Future[None] | None = None  # attempts to connect again, beside the control loop
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Connect, if there is no connection, and wait for a sample."""
-        until = self._clock() + self._patience
+        until = self._clock() + PATIENCE
         while self._clock() < until:
             try:
                 if not self._up() and self._connecting is None:
@@ -176,13 +163,12 @@ class ConnectedPlant(ForeignSystem):
                 self.pace.begin()
                 reading = self._fresh() if self._connected else None
                 if reading is not None:
-                    self.skipped, self._gap = self.skipped - self._gap, 0  # no transition ends with the first reading
+                    self._gap = 0  # no transition ends with the first reading
                     return self._entries(reading)
             except LinkLostError as lost:
                 self._connected, self._lost = False, str(lost)
             self._sleep(min(AGAIN, self.pace.period))
-        why = f": {self._lost}" if self._lost else ""
-        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{why}")
+        raise ValueError(f"the plant has not answered for {PATIENCE:g} s: {self._lost}")
 
     def _up(self) -> bool:
         """Whether there is a connection; what has ended the attempts to connect again is raised here."""
@@ -220,37 +206,27 @@ class ConnectedPlant(ForeignSystem):
                     return reading
                 sample = reading[self._sample_tag]
                 if math.isfinite(sample) and sample != self._sample:
-                    self._follow(sample, looks)
-                    return reading
+                    break
                 looks += 1
                 if self._clock() >= until:
-                    self.stale += 1
-                    self.reasons = {"all tags": self._stale_because(sample)}
+                    why = self.link.quality.get(self._sample_tag, "it was read before")
+                    self.reasons = {"all tags": f"{self._sample_tag} = {sample:.0f} is no new sample: {why}"}
                     return None
                 self._sleep(self.pace.period / LOOKS)
         except LinkLostError as error:
             self._lose(error)
             self.reasons = {"all tags": self._lost}
             return None
-
-    def _stale_because(self, sample: float) -> str:
-        if math.isfinite(sample):
-            return f"sample {sample:.0f} was read before"
-        why = getattr(self.link, "quality", {}).get(self._sample_tag, sample)
-        return f"tag {self._sample_tag} counts no samples: {why}"
-
-    def _follow(self, sample: float, looks: int) -> None:
-        """Keep the phase of the plant's clock: be there when the sample comes, and not long after it."""
-        self._gap = int(sample - self._sample) - 1 if math.isfinite(self._sample) and sample > self._sample else 0
-        self.skipped += self._gap
-        self._sample, self._in_a_row = sample, 0
+        # Keep the phase of the plant's clock: be there when the sample comes, and not long after it.
         self.pace.shift(-EARLIER * self.pace.period if looks == 0 else None)
+        gap = sample - self._sample - 1.0
+        self._gap = int(gap) if 0.0 < gap < math.inf else 0
+        self._sample, self._in_a_row = sample, 0
+        return reading
 
     def _entries(self, reading: dict[str, float] | None) -> TensorDict:
         if reading is not None:
-            quality: Mapping[str, str] = getattr(self.link, "quality", {})
-            used = {tag for tags in self._entries_of.values() for tag in tags}
-            self.reasons = {tag: status for tag, status in quality.items() if tag in used}
+            self.reasons = dict(self.link.quality)
         numbers = {
             key: [math.nan if reading is None else reading[tag] for tag in tags]
             for key, tags in self._entries_of.items()
@@ -263,7 +239,6 @@ class ConnectedPlant(ForeignSystem):
         """Note a late answer, or a lost connection, and then connect again beside the control loop."""
         self._lost = str(error)
         if isinstance(error, LateAnswerError):
-            self.late += 1
             self._in_a_row += 1
             if self._in_a_row < TOLERATED:
                 return

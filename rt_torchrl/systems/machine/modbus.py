@@ -1,17 +1,12 @@
 """A link over Modbus, by a client of pymodbus that the user prepares."""
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field
 from typing import Any, Literal
 
-from rt_torchrl.options import Count, configuration
-from rt_torchrl.systems.machine.connected_plant import (
-    LateAnswerError,
-    LinkLostError,
-    RefusedRequestError,
-    require_timeout,
-)
+from rt_torchrl.options import Count, configuration, require_range
+from rt_torchrl.systems.machine.connected_plant import LONGEST, LateAnswerError, LinkLostError, RefusedRequestError
 
 WIDTHS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
 """Number of registers of each type of numbers."""
@@ -50,14 +45,9 @@ class Register:
             raise ValueError(f"scale={self.scale} of the register at address={self.address} must not be zero.")
 
     @property
-    def width(self) -> int:
-        """Number of registers."""
-        return WIDTHS[self.kind]
-
-    @property
     def end(self) -> int:
         """Address behind the last register."""
-        return self.address + self.width
+        return self.address + WIDTHS[self.kind]
 
 
 class ModbusLink:
@@ -77,43 +67,34 @@ class ModbusLink:
     """
 
     def __init__(self, client: Any, read: Mapping[str, Register], written: Mapping[str, Register], *, device: int = 1):
-        _require_block("read", read)
-        tables = sorted({register.table for register in read.values()})
-        if len(tables) > 1:
-            raise ValueError(
-                f"read={dict(read)} has registers of the tables {' and '.join(tables)}, and one request reads one "
-                "table; let the plant hold all tags in one."
-            )
+        for what, registers in (("read", read), ("written", written)):
+            if len({register.table for register in registers.values()}) != 1 or _span(registers.values())[1] > MOST:
+                raise ValueError(
+                    f"{what}={dict(registers)} must be registers of one table that one request takes, which spans at "
+                    f"most {MOST}; let the plant hold the tags beside each other."
+                )
         self._written = dict(sorted(written.items(), key=lambda item: item[1].address))
-        _require_block("written", written)
         ordered = list(self._written.values())
-        if any(first.end != second.address for first, second in zip(ordered, ordered[1:], strict=False)) or any(
-            register.table == "input" for register in ordered
-        ):
+        gaps = any(first.end != second.address for first, second in zip(ordered, ordered[1:], strict=False))
+        if gaps or ordered[0].table == "input":
             raise ValueError(f"written={dict(written)} must be holding registers one behind the other, without gaps.")
         if client.retries:
             raise ValueError(
                 f"retries={client.retries} of the client must be 0: while it tries again, no command reaches the plant."
             )
-        require_timeout(client.comm_params.timeout_connect)
-        self._client, self._device, self._joined = client, device, False
-        self._read, self._table = dict(read), tables[0]
-
-    @property
-    def _address(self) -> str:
-        return f"{self._client.comm_params.host}:{self._client.comm_params.port}"
+        require_range("timeout", client.comm_params.timeout_connect, *LONGEST, unit="s", of="the client")
+        self._client, self._device, self._read, self.quality = client, device, dict(read), dict[str, str]()
+        self._address = f"{client.comm_params.host}:{client.comm_params.port}"
 
     def connect(self) -> None:
         self._client.close()
-        self._joined = False
-        if not self._asked("to connect", self._client.connect):
+        if not self._client.connect():
             raise LinkLostError(f"{self._address} does not answer.")
-        self._joined = True
 
     def read(self) -> dict[str, float]:
-        first = min(register.address for register in self._read.values())
-        count = max(register.end for register in self._read.values()) - first
-        request = getattr(self._client, f"read_{self._table}_registers")
+        registers = self._read.values()
+        first, count = _span(registers)
+        request = getattr(self._client, f"read_{next(iter(registers)).table}_registers")
         what = f"to read {', '.join(self._read)}"
         words = self._asked(what, request, first, count=count, device_id=self._device).registers
         reading = {}
@@ -124,14 +105,11 @@ class ModbusLink:
         return reading
 
     def write(self, values: Mapping[str, float]) -> None:
-        missing = set(self._written) ^ set(values)
-        if missing:
-            raise ValueError(f"one request writes {list(self._written)}; {sorted(missing)} is missing or unknown.")
-        words: list[int] = []
-        for tag, register in self._written.items():
-            words += self._words(tag, register, values[tag])
+        if set(self._written) != set(values):
+            raise ValueError(f"one request writes {list(self._written)}, and not {list(values)}.")
+        words = [word for tag, register in self._written.items() for word in self._words(tag, register, values[tag])]
         what = "to write " + ", ".join(f"{tag} = {values[tag]:g}" for tag in self._written)
-        first = next(iter(self._written.values())).address
+        first, _ = _span(self._written.values())
         self._asked(what, self._client.write_registers, first, words, device_id=self._device)
 
     def _words(self, tag: str, register: Register, value: float) -> list[int]:
@@ -160,7 +138,7 @@ class ModbusLink:
         Args:
             what: the request in words.
             request: method of the client that makes it.
-            arguments: its arguments, of which the first is the address of the first register.
+            arguments: its arguments.
             options: more arguments.
 
         Raises:
@@ -170,7 +148,7 @@ class ModbusLink:
         from pymodbus.exceptions import ModbusException, ModbusIOException  # here, because the package is an extra
 
         try:
-            if self._joined and not self._client.connected and not self._client.connect():
+            if not self._client.connected and not self._client.connect():
                 raise LinkLostError(f"{self._address} does not answer.")
             answer = request(*arguments, **options)
         except ModbusIOException as error:
@@ -179,30 +157,21 @@ class ModbusLink:
         except (OSError, ModbusException) as error:
             self._client.close()
             raise LinkLostError(f"{self._address}: {type(error).__name__}: {error}") from error
-        if isinstance(answer, bool) or not answer.isError():
+        if not answer.isError():
             return answer
         code = getattr(answer, "exception_code", None)
         if code in REFUSALS:
-            count = options.get("count") or len(arguments[1])
             raise RefusedRequestError(
-                f"{self._address} refuses {what}, registers {arguments[0]} to {arguments[0] + count - 1}: exception "
-                f"{code}, {REFUSALS[code]}. Mend the addresses, or what the machine lets a client read and write."
+                f"{self._address} refuses {what}: exception {code}, {REFUSALS[code]}. Mend the addresses, or what the "
+                "machine lets a client read and write."
             )
         raise LateAnswerError(f"{self._address} does not answer {what} now: {answer}")
 
     def close(self) -> None:
-        self._joined = False
         self._client.close()
 
 
-def _require_block(what: str, registers: Mapping[str, Register]) -> None:
-    """Refuse registers that do not fit one request."""
-    if not registers:
-        raise ValueError(f"{what}={dict(registers)} must name registers.")
-    first = min(register.address for register in registers.values())
-    count = max(register.end for register in registers.values()) - first
-    if count > MOST:
-        raise ValueError(
-            f"{what} spans {count} registers from {first} on, and one request takes at most {MOST}; let the plant hold "
-            "the tags beside each other."
-        )
+def _span(registers: Iterable[Register]) -> tuple[int, int]:
+    """Address of the first of some registers, and their number with those between them."""
+    first = min(register.address for register in registers)
+    return first, max(register.end for register in registers) - first

@@ -8,23 +8,14 @@ import struct
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
-from rt_torchrl.systems.machine.connected_plant import (
-    LateAnswerError,
-    LinkLostError,
-    RefusedRequestError,
-    require_timeout,
-)
+from rt_torchrl.options import require_range
+from rt_torchrl.systems.machine.connected_plant import LONGEST, LateAnswerError, LinkLostError, RefusedRequestError
 
 Result = TypeVar("Result")
 CONNECT = 4.0
 """Longest time of an attempt to connect [s]."""
-FORMATS = dict(
-    zip(
-        ("SByte", "Byte", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Float", "Double"),
-        "bBhHiIqQfd",
-        strict=True,
-    )
-)
+FORMATS = {"SByte": "b", "Byte": "B", "Int16": "h", "UInt16": "H", "Int32": "i", "UInt32": "I", "Int64": "q"}
+FORMATS |= {"UInt64": "Q", "Float": "f", "Double": "d"}
 """Formats of ``struct`` of the types of numbers."""
 PASSING = frozenset(
     {
@@ -52,17 +43,15 @@ class OpcUaLink:
         timeout: longest time of an answer [s]; a fraction of the control period.
 
     Raises:
-        ValueError: if asyncua is not installed, or the time is not positive.
+        ValueError: if the time is none of an answer.
     """
 
     def __init__(
         self, client: Callable[..., Any], read: Mapping[str, str], written: Mapping[str, str], *, timeout: float
     ):
-        try:
-            import asyncua.sync
-        except ImportError as error:
-            raise ValueError("OPC UA needs asyncua: install the extra, pip install 'rt_torchrl[machine]'.") from error
-        require_timeout(timeout)
+        import asyncua.sync  # here, because the package is an extra
+
+        require_range("timeout", timeout, *LONGEST, unit="s", of="the link")
         self._ua: Any = asyncua.ua
         self._thread, self._make_client = asyncua.sync.ThreadLoop, client
         self._read, self._written, self.timeout = dict(read), dict(written), timeout
@@ -104,18 +93,15 @@ class OpcUaLink:
             kind = await node.read_data_type_as_variant_type()
         except ua.UaStatusCodeError as error:
             name = ua.StatusCode(error.code).name
+            if name in UNTOLD:
+                return ua.VariantType.Double
             if name in ("BadNodeIdUnknown", "BadNodeIdInvalid"):
                 raise RefusedRequestError(f"{where}: {name}; name a node that the server has.") from error
-            if name not in UNTOLD:
-                raise
-            return ua.VariantType.Double
+            raise
         if kind == ua.VariantType.Variant:  # any number
             return ua.VariantType.Double
         if kind.name not in FORMATS:
-            raise RefusedRequestError(
-                f"{where}: it holds {kind.name}, and a command is a number; give the machine a node of a numeric type, "
-                "such as Double."
-            )
+            raise RefusedRequestError(f"{where}: it holds {kind.name}; name a node of a numeric type, such as Double.")
         return kind
 
     def _typed(self, tag: str, value: float) -> Any:
@@ -132,12 +118,9 @@ class OpcUaLink:
                     raise ValueError("it takes whole numbers")
             struct.pack(f"<{FORMATS[kind.name]}", number)
         except (ValueError, OverflowError, struct.error) as error:
-            node, bits = f"node {self._written[tag]!r} of type {kind.name}", 8 * struct.calcsize(FORMATS[kind.name])
-            low, high = (0, 2**bits - 1) if FORMATS[kind.name].isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-            takes = "single precision" if kind.name == "Float" else f"whole numbers from {low} to {high}"
             raise RefusedRequestError(
-                f"{self.url}: {tag!r} = {value:g} does not fit {node}, which takes {takes}; give the machine a node of "
-                "type Double."
+                f"{self.url}: {tag!r} = {value:g} does not fit node {self._written[tag]!r} of type {kind.name}: "
+                f"{error}; give the machine a node of type Double."
             ) from error
         return self._ua.Variant(number, kind)
 
