@@ -123,7 +123,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
     episode = flown(found, *STEPS[:-1])
     optimisers = {
         "model_free": lambda: found.learner.actor_adam.parts[0].item(),
-        "model_based": lambda: found.planner.descent._optimiser.state,
+        "model_based": lambda: found.planner._optimiser.state,
     }
     idle, before = other_than(live), weights(found.policies[live])
     assert all(state() for state in optimisers.values())

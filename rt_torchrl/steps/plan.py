@@ -71,7 +71,7 @@ class Planner(Protocol):
         """Go on from the :meth:`state_dict` of a planner with the same configuration."""
 
 
-class WholeEpisodes:
+class WholeEpisodes(Descent):
     r"""Descends :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
 
     Where real episodes contradict the twin, what it expects on the real system is descended instead. Where episodes may
@@ -85,19 +85,20 @@ class WholeEpisodes:
     """
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
-        self.twin, self.policy, self.config = twin, policy, config
-        self.descent = Descent(policy, config.descent)
+        super().__init__(policy, config.descent)
+        self.twin, self.policy, self.options = twin, policy, config
         ends = twin.plant.end_cost is not None and config.method != "single_start"
         self.searched = searched(policy) if ends else []
         """Weights that the simplex searches from where a descent ends."""
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
-        descended = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
+        count = self.options.iterations
+        descended = self.run(lambda: self._cost(episodes, math.inf), count)
         if self.stalled(descended.start, descended.best, descended.gradient):
-            again = self.descent.run(lambda: self._cost(episodes, GRADIENT_LIMIT), self.config.iterations)
+            again = self.run(lambda: self._cost(episodes, GRADIENT_LIMIT), count)
             descended = descended._replace(best=again.best, iterations=descended.iterations + again.iterations)
-        if self.searched and self.config.iterations:
+        if self.searched and count:
             best = by_simplex(self.searched, lambda: self._cost(episodes, math.inf), SEARCHED, size=0.3)
             descended = descended._replace(best=best)
             self.restart()  # the weights have jumped
@@ -108,7 +109,7 @@ class WholeEpisodes:
 
         It promises :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along it.
         """
-        if self.config.method == "single_start":
+        if self.options.method == "single_start":
             return False
         promised = gradient * get_total_norm([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
         return before - after <= NOTHING * abs(before) and promised > GRADIENT_LIMIT * abs(before)
@@ -116,16 +117,6 @@ class WholeEpisodes:
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.twin.expected_costs(self.policy, *episodes)
         return limited_mean(costs, self.policy.parameters(), limit)
-
-    def restart(self) -> None:
-        """Forget the state of the optimiser."""
-        self.descent.restart()
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.descent.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.descent.load_state_dict(state)
 
 
 class RecedingHorizonPlanner:
