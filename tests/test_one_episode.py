@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import pytest
 import torchdiffeq
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector
@@ -68,6 +69,7 @@ def functions_of_episodes(monkeypatch):
     return seen
 
 
+@pytest.mark.filterwarnings("error:engine 'autograd' takes the place")
 def test_torchrl_is_in_the_path_that_runs_by_default_which_goes_through_few_functions(tmp_path, monkeypatch):
     loss = counted(monkeypatch, DDPGLoss, "forward")
     sample = counted(monkeypatch, TensorDictPrioritizedReplayBuffer, "sample")
