@@ -75,6 +75,7 @@ from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Star
 from .loading import begin_loading
 from .options import configuration
 from .runs.compare import Comparison, compare_runs
+from .runs.diagnosis import Reason, diagnose
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run
 from .runs.run_config import Preset, RunConfig, require_device
@@ -155,6 +156,7 @@ __all__ = [
     "Reading",
     "RealController",
     "RealSystem",
+    "Reason",
     "RecedingHorizon",
     "RecedingHorizonPlanner",
     "RecordedFlights",
@@ -199,6 +201,7 @@ __all__ = [
     "compare_runs",
     "configuration",
     "control_cost",
+    "diagnose",
     "export_c",
     "export_controller",
     "export_discon",

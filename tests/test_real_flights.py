@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import operator
 import signal
 
 import pytest
@@ -12,10 +13,12 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import FULL, IDLE
 from test_algorithm import flown, twinning
 from test_classical import PD
+from test_early_ends import STRONG, WEAK, Falling
 from test_real_system import Rig, connected
 
 from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
+from rt_torchrl.runs.real_side import entries
 
 STEPS = 20
 
@@ -139,6 +142,19 @@ def test_judged_policies_keep_the_range_as_in_a_training():
     assert flown.actions.abs().max() == 2.0
 
 
+def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
+    plant = Falling()
+    episodes = RealEpisodes(connected(plant), 3)
+    flights = {name: episodes.fly(LinearGain(gain)) for name, gain in (("live", STRONG), ("weak", WEAK))}
+    assert plant.ended(flights["weak"].states).any(1).all() and not plant.ended(flights["live"].states).any()
+    judged = {name: episodes.judge(flown) for name, flown in flights.items()}
+    costs, others = (judged[name].control_costs for name in ("live", "weak"))
+    found = entries(plant, flights, judged, "live")["controllers"]["weak"]
+    assert found["ratio"]["mean"] == pytest.approx((costs.mean() / others.mean()).item()) and found["cheaper"] == 3
+    flights["weak"] = flights["weak"]._replace(exogenous=flights["weak"].exogenous + 1e-9)  # of other episodes
+    assert "ratio" not in entries(plant, flights, judged, "live")["controllers"]["weak"]
+
+
 class Tracking(PD):
     """A PD law that cancels the disturbance that is measured."""
 
@@ -161,8 +177,15 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     paid = summary["cost_of_learning"]
     assert paid["episodes"] == 11 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)
-    costs = summary["real_unseen"]["costs"]
+    costs, flown = summary["real_unseen"]["costs"], summary["real_unseen"]["controllers"]
     assert [*costs] == [live, "cascade", "mine", "PD"] and (tmp_path / "figures" / "flights.png").is_file()
+    assert "ratio" not in flown[live] and flown["PD"]["cheaper"] == sum(map(operator.lt, costs[live], costs["PD"]))
+    ratio, pairs = flown["PD"]["ratio"], [live / other for live, other in zip(costs[live], costs["PD"], strict=True)]
+    assert ratio["mean"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
+    assert ratio["confidence_interval"] == pytest.approx(sorted(pairs), rel=1e-9)
+    interval = f"[{min(pairs):.4g}, {max(pairs):.4g}]"
+    words_of_both = f"{ratio['mean']:.4g} {interval} of it, cheaper in {flown['PD']['cheaper']} of 2"
+    assert f"the live policy costs {words_of_both}" in said
     assert [cost for each in costs.values() for cost in each] == pytest.approx(rig.costs[3:], rel=1e-9)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     policy = run.algorithm.policies[live]
@@ -190,13 +213,17 @@ def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_pat
 
 
 def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
-    """The model-free arm acts; without iterations its weights are still the random ones."""
+    """The model-free arm acts; without iterations its weights are still the random ones.
+
+    Controllers that fly where it does not are compared with no policy.
+    """
     rig, twinning = machine(), dataclasses.replace(FULL, arm="model_free", learner=IDLE)
     run = run_on(rig, tmp_path, real_unseen=2, twinning=twinning, baselines={"PD": PD, "mine": Tracking})
     flown = run.train()["summary"]["real_unseen"]["controllers"]
-    assert [*flown] == ["PD", "mine"]
+    assert [*flown] == ["PD", "mine"] and not any("ratio" in one for one in flown.values())
     assert len(rig.flights) == 2 + 2 * 2
-    assert "random initial weights" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "random initial weights" in said and said.count("the live policy costs") == 2  # on the twin
 
 
 def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
@@ -228,9 +255,13 @@ def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_traini
     assert f"PD is not judged on the real system: the system failed in interval 4, at 0.4 s: {cause}" in said
 
 
-def test_flights_of_a_resumed_run_are_paid_beside_the_earlier_ones(tmp_path):
+def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
     rig = machine()
-    run_on(rig, tmp_path, real_unseen=2).train()
+    first = run_on(rig, tmp_path, real_unseen=2).train()["summary"]
+    again = run_on(rig, tmp_path, real_unseen=2, resume=True).train()["summary"]
+    assert len(rig.flights) == 2 + 2 and again["real_unseen"] == first["real_unseen"]
+    assert again["cost_of_learning"] == first["cost_of_learning"]
+    # A controller that has not flown yet flies, and so does the policy beside it; what was paid before stays paid.
     run_on(rig, tmp_path, real_unseen=2, resume=True, baselines={"mine": Tracking}).train()
     paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]
     assert len(rig.flights) == 2 + 2 + 2 * 2 == paid["episodes"]

@@ -38,6 +38,22 @@ def on_the_twin(unseen: Mapping[str, Any]) -> bool:
     return unseen["judged_on"] == "twin"
 
 
+def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str, float], str]:
+    """J_a of the live policy, None if it is not finite; the finite ones of classical controllers; and where these hold.
+
+    They are those of the flights on the real system, if the live policy has flown there, and else of unseen episodes: a
+    cost on the twin is not compared with one on the real system.
+    """
+    unseen, live = summary["unseen"], summary["live"]
+    flown = summary.get("real_unseen", {}).get("controllers", {})
+    judged, where = unseen["baselines"] | {live: {"J_a": unseen[f"J_a_{live}"]}}, unseen["judged_on"]
+    if live in flown:
+        judged, where = dict(flown), "real system"
+    cost = judged.pop(live)["J_a"]["mean"]
+    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
+    return cost, {name: mean for name, mean in means.items() if mean is not None}, where
+
+
 def judged_on_the_system(summary: Mapping[str, Any]) -> Mapping[str, Any]:
     """``costs``, ``merit`` and ``baselines`` of a run on the system, not on the run's own twin.
 

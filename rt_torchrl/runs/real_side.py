@@ -1,8 +1,9 @@
 """The real system of a run: in simulation, operated beside the learning, and flown after the training."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -10,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import Judged, TwinEpisodes, UnseenEpisodes, compared
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
@@ -24,6 +25,7 @@ from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -130,6 +132,63 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
     if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
         return f"{live} has its random initial weights"
     return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
+
+
+def entries(
+    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
+) -> dict[str, Any]:
+    """The entry ``real_unseen`` of the summary, without J_p.
+
+    Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
+    the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
+
+    Args:
+        plant: plant of the real system.
+        flights: flights by the name of the controller.
+        judged: what these cost.
+        live: name of the live policy, which need not have flown.
+    """
+    controllers = {}
+    for name, judgement in judged.items():
+        costs = judgement.control_costs
+        controllers[name] = {"episodes": len(costs)} | judgement.statistics()
+        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
+            controllers[name] |= compared(judged[live].control_costs, costs)
+    return {
+        "controllers": controllers,
+        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
+    }
+
+
+def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
+    """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
+    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
+        return False
+    for flights in zip(flown.each(), other.each(), strict=True):
+        inputs = [until_end(plant, flight).exogenous for flight in flights]
+        n = min(map(len, inputs))
+        if not torch.equal(inputs[0][:n], inputs[1][:n]):
+            return False
+    return True
+
+
+def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
+    """The entry that an earlier end of a run has left after as many episodes; None without.
+
+    Args:
+        folder: run folder.
+        episodes: number of episodes of the training.
+        names: names of the controllers that are to fly.
+        count: number of flights of each.
+    """
+    if not (folder / "metrics.json").is_file():
+        return None
+    metrics = read_metrics(folder)
+    entry: dict[str, Any] | None = metrics["summary"].get("real_unseen")
+    if entry is None or len(metrics["episodes"]) != episodes:
+        return None
+    flown = {name: controller["episodes"] for name, controller in entry["controllers"].items()}
+    return entry if flown == dict.fromkeys(names, count) else None
 
 
 def paid_before(folder: Path) -> list[float | None]:

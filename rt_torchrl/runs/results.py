@@ -18,7 +18,7 @@ from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import on_the_twin, real_costs
+from rt_torchrl.runs.metrics import costs_at_the_end, on_the_twin, real_costs
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -259,6 +259,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     summary, episodes = metrics["summary"], metrics["episodes"]
     unseen, fitted, paid = summary["unseen"], summary["twin"], summary["cost_of_learning"]
     where, twin = WHERE.get(unseen["judged_on"], ""), " on the twin" if on_the_twin(unseen) else ""
+    if twin and fitted["noise"]:
+        where = where.replace(twin, f"{twin} with noise of the sensors")
     width = 22 + len(twin)
     lines = ["", f"{metrics['plant']}, {len(episodes)} episodes, judged on {unseen['episodes']} unseen ones{where}"]
     lines.append(f"  {'cost':<{width}}{'untrained':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
@@ -276,9 +278,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     for name, baseline in unseen["baselines"].items():
         mean = _number(baseline["J_a"]["mean"], ".5g")
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
-        ratio = f"{_number(baseline['ratio']['mean'], '.4g')} {_interval(baseline['ratio'])}"
-        cheaper = f"cheaper in {baseline['cheaper']} of {unseen['episodes']}"
-        lines.append(f"    on the same episodes the live policy costs {ratio} of it, {cheaper}")
+        lines.append(beside_line(baseline, unseen["episodes"]))
     lines += merit_lines(unseen)
     lines += real_lines(summary.get("real_unseen"))
     whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
@@ -287,11 +287,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {whole} over "
         f"{paid['episodes']} episodes{after}, largest {most}"
     )
-    if dearer_than_first(summary):
-        lines.append(
-            f"  in the real episodes of the controller that flew first, which cost {summary['first']['paid']:.4g}, the "
-            f"live policy is expected to cost {_number(summary['first']['expected'], '.4g')}"
-        )
+    lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
     # A fit whose residuals are noise has answered the doubts of the first flight.
     if fitted["note"] or not fitted["rms"]:
@@ -315,8 +311,16 @@ def real_lines(real: dict[str, Any] | None) -> list[str]:
     for name, entry in real["controllers"].items():
         mean, who = f"{_number(entry['J_a']['mean'], '.5g')} {_interval(entry['J_a'])}", name.replace("_", "-")
         lines.append(f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean}")
+        if "ratio" in entry:
+            lines.append(beside_line(entry, entry["episodes"]))
         lines += [f"    {quantity:<26}{_value(merit):>20}" for quantity, merit in entry["merit"].items()]
     return lines
+
+
+def beside_line(entry: dict[str, Any], episodes: int) -> str:
+    """A line with what the live policy costs beside a controller in the same episodes."""
+    ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
+    return f"    on the same episodes the live policy costs {ratio} of it, cheaper in {entry['cheaper']} of {episodes}"
 
 
 def _number(value: float | None, digits: str) -> str:
@@ -371,8 +375,13 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None]) -> l
     for name in weights:
         description = closure["described"].get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{description['unit']}]" if description["unit"] else name
-        row = "".join(f"{_number(values.get(name), '.5g'):>12}" for values in columns.values())
+        cells = {column: _number(values.get(name), ".5g") for column, values in columns.items()}
+        if errors.get(name) == 0.0:
+            cells["std. error"] = "fixed"
+        row = "".join(f"{cell:>12}" for cell in cells.values())
         lines.append(f"  {label:<22}{row}   {description['meaning']}".rstrip())
+    if any(error is None or math.isinf(error) for name, error in errors.items() if name in weights):
+        lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
     return lines
 
 
@@ -405,13 +414,19 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     return [f"  {text}", *(f"  episode {record['episode']}: {record['warning']}" for record in warned)]
 
 
-def dearer_than_first(summary: Mapping[str, Any]) -> bool:
-    """Whether the controller that flew first is expected to cost less than the live policy."""
+def dearer_than_first(summary: Mapping[str, Any]) -> str:
+    """That the controller that flew first is expected to cost less than the live policy; empty if it is not."""
     first = summary["first"]
-    return first is not None and (first["expected"] is None or first["expected"] > first["paid"])
+    if first is None or (first["expected"] is not None and first["expected"] <= first["paid"]):
+        return ""
+    expected = _number(first["expected"], ".4g")
+    return (
+        f"in the real episodes of the controller that flew first, which cost {first['paid']:.4g}, the live policy is "
+        f"expected to cost {expected}"
+    )
 
 
-def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig) -> str:
+def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
     Args:
@@ -419,24 +434,29 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig) -> str:
         folder: run folder.
         config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
     """
-    summary = metrics["summary"]
-    better, unseen = summary["better"], summary["unseen"]
-    made = isinstance(config, MakesPlant)
-    call = f"rt_torchrl.load_run({str(folder)!r}{'' if made else ', plant=...'})"
+    summary, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
+    live, (cost, known, place) = summary["live"], costs_at_the_end(summary)
+    twin = place == "twin"
+    best = min(known, key=known.__getitem__, default=None)
+    call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
-    cost = unseen[f"J_a_{better}"]["mean"]
-    known = [mean for baseline in unseen["baselines"].values() if (mean := baseline["J_a"]["mean"]) is not None]
-    if cost is None or cost >= min(known, default=math.inf) or (on_the_twin(unseen) and dearer_than_first(summary)):
-        steps.append(
-            "no policy is better than the classical controllers, or it diverges: train longer, let it observe what "
-            "they compute, or give more --twinning.planner.iterations"
-        )
-    elif not made:
-        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({better!r}), 'it.c', plant)")
+    if cost is None:
+        where = "unseen episodes on the twin" if twin else "unseen episodes"
+        steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
+    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
+        better = best if best is not None and cost >= known[best] else "the controller that flew first"
+        other = "let the policy observe what that controller computes, or train with more --twinning.planner.iterations"
+        steps.append(f"{better} is better than the live policy: keep it, {other}")
+    elif summary["better"] != live:
+        steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
+    elif not alone:
+        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
+    elif live == "model_based" and config is not None and config.twinning.planner.method == "receding_horizon":
+        steps.append(f"take the twin away, on which it plans: {call_of('export')} {folder} --what twin")
     else:
-        plans = better == "model_based" and config.twinning.planner.method == "receding_horizon"
-        what = "--what twin" if plans else f"--role {better}"
-        steps.append(f"take the controller away: {call_of('export')} {folder} {what}")
-    if on_the_twin(unseen) and "real_unseen" not in summary:
-        steps.append("judge the live policy on the real system: --resume and, for five flights, --real-unseen 5")
+        steps.append(f"take the controller away: {call_of('export')} {folder} --role {live}")
+    if twin and "real_unseen" not in summary:
+        steps.append(
+            "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
+        )
     return "\n".join(f"  next: {step}" for step in steps)

@@ -300,12 +300,17 @@ class Run:
         """
         count, live = self.config.real_unseen, self.algorithm.referee.live
         interrupted = len(self.episodes) < self.config.episodes and self.ended is None
-        if self._real is None or not count or interrupted:
+        if self._real is None or not count:
             return None
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
         if reason := real_side.grounded(self.config, self.algorithm, self.initial_policies):
             bar.write(f"the live policy does not fly the real system: {reason}")
             del laws[live]
+        if earlier := real_side.judged_before(self.folder, len(self.episodes), laws, count):
+            bar.write("the real system has been flown after these episodes; it is not flown again")
+            return earlier
+        if interrupted:
+            return None
         names = ", ".join(f"{count} of {name}" for name in laws)
         bar.write(f"{count * len(laws)} flights on the real system, which count as paid: {names}")
         bar.doing("judging on the real system")
@@ -320,10 +325,8 @@ class Run:
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        costs = {name: judgement.control_costs.tolist() for name, judgement in judged.items()}
-        self._paid += [cost for of_controller in costs.values() for cost in of_controller]
-        controllers = {name: {"episodes": count} | judgement.statistics() for name, judgement in judged.items()}
-        entry: dict[str, Any] = {"controllers": controllers, "costs": costs}
+        entry = real_side.entries(episodes.plant, flights, judged, live)
+        self._paid += [cost for costs in entry["costs"].values() for cost in costs]
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
             entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}
