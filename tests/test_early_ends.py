@@ -290,7 +290,7 @@ def test_what_does_not_go_with_ends_is_refused(tmp_path):
     with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
         CommandCost(plant, plant.closure, 10)
     config = rt.RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
-    with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
+    with pytest.raises(ValueError, match="episodes that do not end early, .*the plant is 'falling'"):
         operation_of(config, rt.PlantEnv(plant), None, plant, {})
 
 
