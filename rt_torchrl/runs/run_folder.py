@@ -211,9 +211,10 @@ class RunFolder:
             if holds_run:
                 read_settings(self.path)  # which refuses a file of somebody else that would be overwritten
             return
+        if holds_run:
+            require_same(self.path, self._config, self._controllers)
         if not holds_run or (finished and not checkpoints(self.path)):
             raise ValueError(f"log_dir={self.path} holds no run to resume: it needs {FILE} and a checkpoint. {ANEW}")
-        require_same(self.path, self._config, self._controllers)
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
