@@ -19,7 +19,7 @@ from rt_torchrl import figures as drawings
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
-from rt_torchrl.steps.plan import MakePlan, make_planner
+from rt_torchrl.steps.plan import MultiStart, make_planner
 from rt_torchrl.steps.switch import make_referee
 
 
@@ -126,14 +126,14 @@ def with_all_parts(folder, episodes, **options):
 def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, monkeypatch):
     whole = with_all_parts(tmp_path / "whole", 3)
     started = [weight.clone() for weight in whole.algorithm.policies["model_free"].parameters()]
-    found, plan = whole.train(), MakePlan.forward
+    found, plan = whole.train(), MultiStart.forward
 
     def pressed(self, flowing):
         if flowing["number"] == 1:
             raise KeyboardInterrupt
         return plan(self, flowing)
 
-    monkeypatch.setattr(MakePlan, "forward", pressed)
+    monkeypatch.setattr(MultiStart, "forward", pressed)
     interrupted = with_all_parts(tmp_path / "parts", 3)
     assert len(interrupted.train()["episodes"]) == 1
     monkeypatch.undo()

@@ -26,7 +26,7 @@ from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings
 from rt_torchrl.steps.learn import ActorCritic
-from rt_torchrl.steps.plan import MakePlan
+from rt_torchrl.steps.plan import MultiStart
 
 
 def begun(path, **options):
@@ -214,7 +214,7 @@ def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(MakePlan, "forward", killed)
+        patched.setattr(MultiStart, "forward", killed)
         for _ in range(2):  # the same command again, although the first has written the options
             with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
                 small_run(tmp_path, episodes=1, **QUICK).train()
