@@ -62,6 +62,9 @@ class Config:
             if not set(FORMATS[what]) & set(formats):
                 allowed = " or ".join(FORMATS[what])
                 raise ValueError(f"formats={formats} holds no format of the {what}; add {allowed}.")
+        unused = [kind for kind in self.formats or () if not any(kind in FORMATS[what] for what in self.what)]
+        if unused:
+            raise ValueError(f"no {unused[0]} of {' and '.join(self.what)} can be written; leave it out.")
         if self.name is not None and not (self.name.isascii() and self.name.isidentifier()):
             raise ValueError(f"name={self.name!r} must be a name in C; give --output a folder.")
 

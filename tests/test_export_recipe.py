@@ -86,6 +86,7 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
         ({"what": ("plant",)}, r"what=\('plant',\) must be some of policy, controller, twin"),
         ({"what": ("policy", "twin"), "formats": ("pt2",)}, r"formats=\('pt2',\) holds no format of the twin; add c\."),
         ({"what": ("policy", "controller"), "formats": ("pt2",)}, r"no format of the controller; add c or discon\."),
+        ({"what": ("controller",), "formats": ("c", "pt2")}, "no pt2 of controller can be written; leave it out"),
         ({"name": "../up"}, "name='../up' must be a name in C"),
         ({"recipe": Path("nowhere.py")}, "nowhere.py does not exist"),
         ({"recipe": RECIPES / "record_log.py"}, "Config of recipe=.* is no class derived from RunConfig"),
