@@ -201,7 +201,7 @@ def test_every_violation_is_told_at_once():
 
 def test_a_sound_plant_is_told_what_was_checked():
     found = rt.check_plant(LinearQuadratic(dt=0.1), steps=10, traced=False)
-    assert re.search("fulfils its contract.* on 4 flights of 10 intervals of 0.1 s; a step errs by .* %", str(found))
+    assert re.search("fulfils its contract.*; a step errs by .* %", str(found))
     # The step is of fourth order: twice as many err by a sixteenth, and by that of a move of half the length.
     finer = rt.check_plant(LinearQuadratic(dt=0.05), steps=10, traced=False)
     assert found.step_error / finer.step_error == pytest.approx(16.0, rel=0.15)

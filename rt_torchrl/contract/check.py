@@ -37,9 +37,6 @@ class ContractReport(NamedTuple):
     Args:
         plant: name of the plant.
         checks: names of the checks.
-        episodes: number of flights.
-        steps: number of control intervals of each flight.
-        dt: control interval [s].
         step_error: what a Runge-Kutta step leaves of the greatest move of a state in one, against two half steps; None
             for a plant with a scheme of its own.
         untraceable: what keeps the engine ``native`` from the plant, whose place ``autograd`` then takes; None if
@@ -48,19 +45,13 @@ class ContractReport(NamedTuple):
 
     plant: str
     checks: tuple[str, ...]
-    episodes: int
-    steps: int
-    dt: float
     step_error: float | None = None
     untraceable: str | None = None
 
     def __str__(self) -> str:
         accuracy = "" if self.step_error is None else f"; a step errs by {100 * self.step_error:.1g} % of its move"
         engine = f"; engine 'autograd' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
-        return (
-            f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}, on {self.episodes} flights of "
-            f"{self.steps} intervals of {self.dt:g} s{accuracy}{engine}"
-        )
+        return f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}{accuracy}{engine}"
 
 
 class PlantContractError(ValueError):
@@ -114,7 +105,7 @@ def check_plant(
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), violations)
     calls = Calls.at_the_start(plant, episodes)
     reason = untraceable(calls) if traced else None
-    return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), episodes, steps, plant.dt, step_error(calls), reason)
+    return ContractReport(plant.name, (*ALWAYS, *ON_FLIGHTS), step_error(calls), reason)
 
 
 def _on_flights(plant: Plant, episodes: int, steps: int, *, trained: bool) -> list[str]:
