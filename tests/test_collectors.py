@@ -70,10 +70,7 @@ def test_an_episode_is_that_of_torchrls_own_collector(kind):
         torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-13, msg=str(key))
 
 
-WORN = [LinearClosure(torch.full((2, 2), -0.1 * k)) for k in range(3)]
-
-
-@pytest.mark.parametrize("options", [{}, {"noise": 0.02}, {"wear": WORN.__getitem__}])
+@pytest.mark.parametrize("options", [{}, {"noise": 0.02}])
 def test_every_entry_is_that_of_stepping(options):
     # The same operations; batched sums of the observation may round in another order.
     compare(lambda: system(LinearQuadratic(horizon=2.0), **options), (1.0, 0.5, 0.0), rtol=1e-12, atol=1e-13)

@@ -60,7 +60,7 @@ Baseline = ClassicalController | RealController
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
-    The true closure is the plant's own; assign :attr:`closure` for a system that has worn. Controllers that are flown
+    The true closure is the plant's own; assign :attr:`closure` for another one. Controllers that are flown
     beside policies are made for :attr:`physics`, the plant itself; assign the plant that is known of a system with
     states that no sensor reads. :attr:`bounds` on states are counted among the plant's own quantities.
 

@@ -216,7 +216,7 @@ class FlightCollector(EpisodeCollector):
         if isinstance(policy, StateFeedback) and law is None:
             return super().rollout()
         reset(env)
-        closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn
+        closure, ((initial_state, exogenous), factor) = env.closure, env.drawn
         n, plant = exogenous.shape[1], env.plant
         noise = torch.stack([self.actor.draw_noise((len(initial_state), len(plant.actions))) for _ in range(n)], 1)
         factors = torch.stack([factor, *(env.sensor_factor() for _ in range(n))], 1)

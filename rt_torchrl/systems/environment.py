@@ -1,6 +1,6 @@
 """The real system in simulation: any plant as a TorchRL environment, and environments around systems."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -43,8 +43,6 @@ class PlantEnv(EnvBase):
             s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
             the true state. What a controller memorises (:attr:`Plant.memories`) is what was measured then, and gets no
             further noise.
-        wear: function from the number of an episode, counted from 0, to the real system's closure in it; with None the
-            plant's own closure holds in all episodes.
 
     Raises:
         ValueError: if ``noise`` is out of its range.
@@ -57,7 +55,6 @@ class PlantEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str = "cpu",
         noise: float = 0.0,
-        wear: Callable[[int], nn.Module] | None = None,
     ):
         require_number("seed", seed, whole=True)
         require_range("noise", noise, 0.0, 1.0, unit="-", of="the sensors")
@@ -67,13 +64,13 @@ class PlantEnv(EnvBase):
         # The sensors have their own generator, so that sensors of any quality see the same disturbances.
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
-        self._noise, self._wear, self._episodes = noise, wear, 0
+        self._noise = noise
         declare_specs(self, plant)
 
     @property
     def closure(self) -> nn.Module:
-        """The true closure in the episode that was flown last."""
-        return self.plant.closure if self._wear is None else self._wear(max(self._episodes - 1, 0)).to(self.device)
+        """The true closure."""
+        return self.plant.closure
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -82,13 +79,11 @@ class PlantEnv(EnvBase):
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Everything that the next reset depends on."""
-        generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
-        return generators | {"episodes": self._episodes}
+        return {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._generator.set_state(state["generator"].cpu())
         self._sensors.set_state(state["sensors"].cpu())
-        self._episodes = state["episodes"]
 
     def _draw(self) -> tuple[Tensor, Tensor]:
         """Initial state and exogenous inputs of the next episode."""
@@ -113,14 +108,6 @@ class PlantEnv(EnvBase):
         false = torch.zeros(1, 1, dtype=torch.bool, device=self.device)
         return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
 
-    def begin_episode(self) -> nn.Module:
-        """Count an episode and return its closure.
-
-        A reset does not count an episode, because a reset need not be followed by a flight.
-        """
-        self._episodes += 1
-        return self.closure
-
     @property
     def drawn(self) -> tuple[Scenario, Float[Tensor, "1 n_s"]]:
         """Initial state and exogenous inputs of the last reset, and the sensors' factors on the first state."""
@@ -128,11 +115,9 @@ class PlantEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._step_count == 0:
-            self._closure = self.begin_episode()
         t, exogenous = self._now()
         command = tensordict["action"]
-        transition = self.plant.step(t, self._state, command, exogenous, self._closure)
+        transition = self.plant.step(t, self._state, command, exogenous, self.closure)
         cost = self.plant.running_cost(t, self._state, transition.applied, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
             raise DivergenceError(
