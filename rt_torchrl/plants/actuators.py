@@ -110,6 +110,10 @@ class LaggedActuator(Actuator):
             mean = mean + off * share
         return replaced(applied, self.place, mean), torch.stack(ends, -1)
 
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        before = torch.cat([applied[..., self.place : self.place + 1], hidden[..., :-1]], -1)
+        return (before - hidden) * self.stages / self.coefficients(closure)[0]
+
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., -1])
 
@@ -156,6 +160,13 @@ class ResonantActuator(Actuator):
         rate = v * (cosine - decay * sine) - omega * omega * off * sine
         mean = demand - (rate - v + 2.0 * decay * (end - off)) / (omega * omega * self.dt)
         return replaced(applied, self.place, mean), torch.stack([demand + end, rate], -1)
+
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        x, v = hidden.unbind(-1)
+        omega, odds = self.coefficients(closure).unbind()
+        zeta = odds / (1.0 + odds)
+        pull = omega * omega * (applied[..., self.place] - x)
+        return torch.stack([v, pull - 2.0 * zeta * omega * v], -1)
 
     def rest(self, base: State) -> Hidden:
         position = super().rest(base)[..., 0]
