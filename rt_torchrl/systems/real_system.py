@@ -173,8 +173,8 @@ class RealSystem(EnvBase):
     Raises:
         ValueError: if ``env`` is not a TorchRL environment or is a batch of systems, an entry is missing or misshapen,
             a constant input is not finite, the plant has states that no sensor reads, the environment's range of an
-            action does not contain the plant's; in a step, if an entry that is read is not reported, or the environment
-            ends the episode where the plant does not.
+            action does not contain the plant's, or its time limit is shorter than the plant's horizon; in a step, if an
+            entry that is read is not reported, or the environment ends the episode where the plant does not.
     """
 
     observation_spec: Composite
@@ -229,6 +229,13 @@ class RealSystem(EnvBase):
             raise ValueError(
                 "the environment reports the action that it has applied, as a safety layer does, but no reading reads "
                 'it: give applied=Reading(keys=("applied",)), in the plant\'s units.'
+            )
+        limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)  # of Gymnasium
+        if limit is not None and limit < self.plant.n_steps:
+            raise ValueError(
+                f"the environment truncates an episode after {limit} of the {self.plant.n_steps} control intervals of "
+                f"plant {self.plant.name!r}; use a horizon of at most {limit * self.plant.dt:g} s, or make the "
+                "environment with a greater max_episode_steps."
             )
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
