@@ -14,9 +14,9 @@ from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
 from torchrl.envs import GymWrapper
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, RealSystem, Trajectory
+from rt_torchrl import AssimilationConfig, DigitalTwin, Reading, RealSystem, Trajectory
 from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
-from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
+from rt_torchrl.envs.pendulum.real import angle_and_speed, gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
 from rt_torchrl.fit.log import checked
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
@@ -49,7 +49,7 @@ def somewhere(count, seed=0):
 
 def test_a_time_limit_below_the_horizon_is_refused_before_anything_flies():
     with pytest.raises(ValueError, match=r"after 200 of the 300 .*horizon of at most 10 s.*max_episode_steps"):
-        RealSystem(GymWrapper(gymnasium.make("Pendulum-v1")), Pendulum(horizon=15.0))
+        RealSystem(GymWrapper(gymnasium.make("Pendulum-v1")), Pendulum(horizon=15.0), state=Reading(of=angle_and_speed))
 
 
 @pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (0.7, 1.3)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import pytest
 import torch
@@ -32,11 +33,11 @@ def limited(limits=LIMITS, **options):
 
 def test_what_leaves_a_limit_is_found_by_hand():
     plant = LinearQuadratic(horizon=0.4)
-    states = torch.tensor([[0.0, 9.0], [0.0, 3.0], [9.0, -3.1], [0.0, 0.0], [0.0, 0.0]]).double()
+    states = torch.tensor([[0.0, 9.0], [0.0, 3.0], [9.0, -3.1], [0.0, 0.0], [0.0, math.nan]]).double()
     actions = torch.tensor([[1.0], [0.5], [-0.1], [1.1]]).double()
     found = OperatingLimits(plant, LIMITS).broken(Trajectory(states, actions, torch.zeros(4, 1).double()))
-    # The first state is nobody's fault; steps of 0.5 are 5 N/s.
-    assert found["states"].tolist() == [False, True, False, False]
+    # The first state is nobody's fault, NaN lies between no limits, and steps of 0.5 are 5 N/s.
+    assert found["states"].tolist() == [False, True, False, True]
     assert found["actions"].tolist() == [False, False, False, True]
     assert found["rates"].tolist() == [False, False, True, True]
 

@@ -165,8 +165,9 @@ class Watchdog:
         faults: dict[str, str] = {}
         if broken := [name for name, value in entries.items() if not value.isfinite().all()]:
             faults["not finite"] = ", ".join(broken)
+        finite = {name: value for name, value in entries.items() if name not in broken}
         for kind, ranges in (("out of range", self.config.ranges), ("limit", self.config.limits)):
-            if outside := [name for name in ranges if name in entries and _outside(entries[name], ranges[name]).any()]:
+            if outside := [name for name in ranges if name in finite and _outside(finite[name], ranges[name]).any()]:
                 faults[kind] = ", ".join(outside)
         self.stale = 0
         for entry, limit in self.config.frozen.items():
@@ -446,9 +447,9 @@ def require_layer(env: EnvBase) -> None:
 
 
 def _outside(values: Tensor, ends: Range) -> Bool[Tensor, "*batch n"]:
-    """Where values lie beyond their ends; NaN is a fault of its own."""
+    """Where values do not lie between their ends, as NaN never does."""
     low, high = (torch.as_tensor(end, dtype=values.dtype, device=values.device) for end in ends)
-    return (values < low) | (values > high)
+    return ~((values >= low) & (values <= high))
 
 
 def _ends(signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:
