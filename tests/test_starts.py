@@ -113,12 +113,24 @@ def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believ
     assert not isinstance(Run(alone, Suspecting(horizon=4.0)).algorithm.twin, TwinEnsemble)
 
 
+class Cubic(LinearClosure):
+    """Another law with weights of the same shapes."""
+
+    def forward(self, features):
+        return super().forward(features**3)
+
+
 def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
     speed = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
     for changed, options, message in (
         ({"name": "other"}, {}, "is a run of plant 'linear_quadratic', this run is of plant 'other'"),
         ({"observations": speed}, {}, "whose observations are .*velocity_error"),
         ({}, {"closure": "mlp"}, r"whose closure does not fit that of this run"),
+        (
+            {"make_closure": lambda self, generator: Cubic(self.true_closure)},
+            {},
+            "LinearClosure; that of this run is a Cubic",
+        ),
     ):
         plant = type("Other", (LinearQuadratic,), changed)(horizon=2.0, noise=0.1)
         with pytest.raises(ValueError, match=message):

@@ -71,6 +71,11 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> EarlierPolicies:
                 f"{', '.join(map(str, present))}. Give the options of that run, such as --observe, or another start."
             )
     closure, hypotheses = config.make_closure(plant, torch.Generator()), None
+    kinds = [type(module).__name__ for module in (run.closure, closure)]
+    if kinds[0] != kinds[1]:  # weights of the same shapes may be those of another law
+        raise ValueError(
+            f"{where} whose closure is a {kinds[0]}; that of this run is a {kinds[1]}; give its --closure."
+        )
     try:
         closure.load_state_dict(run.closure.state_dict())
         twin = make_twin(plant, closure, config.twinning.hypotheses)
