@@ -103,11 +103,12 @@ def test_a_training_flies_its_episodes_and_nothing_else_and_is_judged_on_the_twi
 class Blind(PlantEnv):
     """A simulation whose state cannot be read in the seventh interval of some episodes."""
 
-    blind = ()
+    blind, flown = (), 0
 
     def _step(self, tensordict):
+        self.flown += self._step_count == 0
         found = super()._step(tensordict)
-        if self._episodes in self.blind and self._step_count == 7:
+        if self.flown in self.blind and self._step_count == 7:
             found["state"] = torch.full_like(found["state"], torch.nan)
         return found
 
@@ -119,13 +120,13 @@ def test_a_judged_flight_with_a_refused_reading_is_flown_again(blind, flights):
     machine = Blind(plant, seed=0)
     layer = SafetyLayer(machine, SafetyConfig(interval=plant.dt), fallback=(0.0,))
     system = as_reported(layer, plant)
-    begun, machine.blind = machine._episodes, [machine._episodes + k for k in blind]
+    begun, machine.blind = machine.flown, [machine.flown + k for k in blind]
     if flights is None:
         with pytest.raises(ValueError, match="3 real episodes in a row cannot be used: the safety layer refused 1 of"):
             RealEpisodes(system, 2).fly(LinearGain([[-0.5, -0.5]]))
         return
     flown = RealEpisodes(system, 2).fly(LinearGain([[-0.5, -0.5]]))
-    assert machine._episodes == begun + flights and flown.states.isfinite().all()
+    assert machine.flown == begun + flights and flown.states.isfinite().all()
 
 
 class Asked(RealController):
