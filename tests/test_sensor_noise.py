@@ -65,6 +65,28 @@ def test_flights_with_noise_are_those_of_the_closed_loop_step_by_step(kind, engi
     assert twin.cost(policy, record.states[:1], inputs).item() == pytest.approx(cost, rel=1e-12)
 
 
+class Integrating(LinearQuadratic):
+    """A plant whose second state is the integral of the first one, which its controller computes."""
+
+    controller_states = ("velocity",)
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return torch.stack([action[..., 0] - 0.3 * state[..., 0], state[..., 0]], -1)
+
+
+@torch.no_grad()
+def test_an_integral_of_what_is_read_tells_nothing_of_the_noise():
+    plant, records = Integrating(horizon=40.0), []
+    for seed in range(4):
+        record = episode(plant, LinearGain([[0.8, 0.0]]), LEVELS * torch.tensor([1.0, 0.0]), seed=seed)[0]
+        for k, (command, z) in enumerate(zip(record.actions, record.exogenous, strict=True)):  # of the readings
+            end = plant.step(torch.tensor(k * plant.dt).double(), record.states[k], command, z, plant.closure).state
+            record.states[k + 1, 1] = end[1]
+        records.append(record)
+    found = noise_levels(DigitalTwin(plant, plant.closure), records)
+    assert found.tolist() == pytest.approx([LEVELS[0].item(), 0.0], rel=0.1)
+
+
 @pytest.mark.parametrize("shares", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
 def test_increments_tell_the_noise_of_each_sensor(shares):
     plant, policy = LinearQuadratic(horizon=40.0), LinearGain([[0.8, 0.6]])

@@ -231,7 +231,9 @@ def noise_levels(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Tens
     .. math:: \sigma_j^2 = -\sum_k e_{k-1,j}\,A_{k,j}^\top We_k \Big/ \sum_k A_{k,j}^\top WA_{k,j}
 
     with the column :math:`A_{k,j}` and the weights W, one over the mean square of each increment. A sensor whose
-    increments are mostly something else has none. Only three measured samples in a row tell something.
+    increments are mostly something else has none. Only three measured samples in a row tell something. What a
+    controller computes from readings (:attr:`Plant.controller_states`) tells nothing of their noise: it holds what was
+    read, and the twin misses nothing of it.
 
     Args:
         twin: the twin, fitted to the records.
@@ -256,6 +258,8 @@ def noise_levels(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Tens
         later.append(missed[1:][measured])
         slopes.append(slope[1:][measured].nan_to_num(posinf=0.0, neginf=0.0))
     e, following, A = torch.cat(earlier), torch.cat(later), torch.cat(slopes)
+    computed = torch.tensor([signal.name in twin.plant.controller_states for signal in signals], device=A.device)
+    A = torch.where(computed & ~computed.unsqueeze(-1), 0.0, A)
     squares = following.square().mean(0)
     weighted = A * squares.reciprocal().nan_to_num(posinf=0.0)
     products = -(e * (weighted * following.unsqueeze(1)).sum(-1)).sum(0)
