@@ -38,7 +38,6 @@ class DoublePendulum(rt.Plant):
     )
     state_sizes = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)
     actions = (rt.Signal(symbol="u", name="command", unit="-", low=-1.0, high=1.0),)
-    inputs = ()
     measurements = tuple(rt.Measurement.of(s, scale=size) for s, size in zip(states, state_sizes, strict=True))
     end_cost = 9.36  # what an upright pendulum earns in Gymnasium, and a fallen one does not
 

@@ -80,7 +80,6 @@ class Pendulum(Plant):
         Signal(symbol=r"\dot\theta", name="angular_speed", unit="rad/s", low=-greatest_speed, high=greatest_speed),
     )
     actions = (Signal(symbol="u", name="torque", unit="N m", low=-greatest_torque, high=greatest_torque),)
-    inputs = ()
     observations = (
         Signal(symbol=r"\cos\theta", name="cosine", unit="-", low=-1.0, high=1.0),
         Signal(symbol=r"\sin\theta", name="sine", unit="-", low=-1.0, high=1.0),

@@ -81,7 +81,7 @@ class Plant(nn.Module):
     name: str
     states: tuple[Signal, ...]
     actions: tuple[Signal, ...]
-    inputs: tuple[Signal, ...]
+    inputs: tuple[Signal, ...] = ()
     observations: tuple[Signal, ...]
     measurements: tuple[Measurement, ...] = ()
     """What the sensors give; empty in a plant that defines ``observations`` and :meth:`observe` itself."""
