@@ -127,10 +127,12 @@ class MisreadWind(Blown):
         gain: gain g of the anemometer, positive.
 
     Raises:
-        ValueError: if the turbine does not step by its vector field.
+        ValueError: if the gain is not positive and finite, or the turbine does not step by its vector field.
     """
 
     def __init__(self, base: Plant, gain: float):
+        if not 0.0 < gain < math.inf:
+            raise ValueError(f"gain={gain} of the anemometer must be positive and finite.")
         super().__init__(base)
         turbine: Any = base.innermost
         self.gain, self.cutoff = gain, 2.0 * math.pi * turbine.filter_frequency
@@ -166,13 +168,15 @@ class SwayingTower(Blown):
         softness: share by which Ω is lower than that of the reference tower, in [0, 1).
 
     Raises:
-        ValueError: if the turbine does not step by its vector field.
+        ValueError: if the softness is out of its range, or the turbine does not step by its vector field.
     """
 
     mass, natural_frequency, damping = 437e3, 2.04, 0.01
     thrust_coefficient, thrust_pitch = 0.81, 9.0
 
     def __init__(self, base: Plant, softness: float = 0.0):
+        if not 0.0 <= softness < 1.0:
+            raise ValueError(f"softness={softness} of the tower must lie in [0, 1).")
         place = Signal(symbol="x", name="tower_top", unit="m")
         super().__init__(base, [place, Signal(symbol="v", name="tower_top_speed", unit="m/s")])
         self.frequency = self.natural_frequency * (1.0 - softness)
@@ -208,10 +212,12 @@ class LossySpeed(Blown):
         share: share κ of the rated torque at rated speed.
 
     Raises:
-        ValueError: if the turbine does not step by its vector field.
+        ValueError: if the share is not positive and finite, or the turbine does not step by its vector field.
     """
 
     def __init__(self, base: Plant, share: float):
+        if not 0.0 < share < math.inf:
+            raise ValueError(f"share={share} of the rated torque must be positive and finite.")
         super().__init__(base)
         self.share = share
 

@@ -130,9 +130,9 @@ def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: 
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         own = [x for x in frames if not x.filename.startswith((LIBRARY, "<")) and "site-packages" not in x.filename]
-        first, *_, last = own * 2 or frames[-1:] * 2
+        own = own or [frames[-1]]
         yield (
-            f"{name or first.name}: raised {type(error).__name__} in {last.filename}, line {last.lineno}: "
+            f"{name or own[0].name}: raised {type(error).__name__} in {own[-1].filename}, line {own[-1].lineno}: "
             f"{first_line(error)}. {REMEDY}"
         )
 

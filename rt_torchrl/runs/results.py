@@ -280,7 +280,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
         lines.append(beside_line(baseline, unseen["episodes"]))
     lines += merit_lines(unseen)
-    lines += real_lines(summary.get("real_unseen"))
+    lines += real_lines(summary.get("real_unseen"), fitted["segment"])
     whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     after = f", {len(paid['judging'])} of them after the training" if "judging" in paid else ""
     lines.append(
@@ -300,14 +300,15 @@ def results_table(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def real_lines(real: dict[str, Any] | None) -> list[str]:
+def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
     """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
     if real is None:
         return []
     lines = []
     if "J_p" in real:
         before, after = (_number(real[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
-        lines.append(f"  J_p on the real system: {after}, with the first closure {before}")
+        over = f", over segments of {segment} intervals" if segment else ""
+        lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
     for name, entry in real["controllers"].items():
         mean, who = f"{_number(entry['J_a']['mean'], '.5g')} {_interval(entry['J_a'])}", name.replace("_", "-")
         lines.append(f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean}")
