@@ -1,7 +1,9 @@
-"""What a program says and sets before it imports PyTorch, which takes seconds."""
+"""What a program says before it imports PyTorch, which takes seconds, and packages that only some programs need."""
 
+import importlib
 import os
 import sys
+from types import ModuleType
 
 
 def begin_loading() -> None:
@@ -12,3 +14,17 @@ def begin_loading() -> None:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     print("loading PyTorch and TorchRL", file=sys.stderr, flush=True)
+
+
+def of_extra(module: str, extra: str) -> ModuleType:
+    """A module of a package that an extra of this library installs.
+
+    Raises:
+        ValueError: if the package is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"{error.name} is not installed: install the extra, pip install 'rt_torchrl[{extra}]'."
+        ) from error

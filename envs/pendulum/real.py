@@ -5,6 +5,7 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.loading import of_extra
 from rt_torchrl.systems.real_system import Reading, RealSystem
 
 
@@ -23,11 +24,9 @@ def gymnasium_pendulum(plant: Pendulum, *, seed: int = 0, device: torch.device |
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if Gymnasium's time step is not that of the plant.
+        ValueError: if Gymnasium is not installed, or its time step is not that of the plant.
     """
-    import gymnasium
-
-    env = gymnasium.make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
+    env = of_extra("gymnasium", "gym").make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
     dt = vars(env.unwrapped)["dt"]
     if dt != plant.dt:
         raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {dt} s.")

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import RealController
+from rt_torchrl.loading import of_extra
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.adapters import CallingSimulator, Controller
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
@@ -37,11 +38,9 @@ STEP = 0.1
 @cache
 def rosco() -> ModuleType:
     """ROSCO's toolbox with its modules, which the extra ``rosco`` installs."""
-    import rosco
-    from rosco.toolbox import control_interface, controller, sim, turbine, utilities  # noqa: F401
-    from rosco.toolbox.inputs import validation  # noqa: F401
-
-    return rosco
+    for module in ("control_interface", "controller", "sim", "turbine", "utilities", "inputs.validation"):
+        of_extra(f"rosco.toolbox.{module}", "rosco")
+    return of_extra("rosco", "rosco")
 
 
 def examples() -> Path:
@@ -194,8 +193,8 @@ def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if the plant's control interval does not fit, or the plant is none that ROSCO simulates.
-        ImportError: if ROSCO is not installed.
+        ValueError: if ROSCO is not installed, the plant's control interval does not fit, or the plant is none that
+            ROSCO simulates.
     """
     turbine_of(plant)
     interval = steps_of(plant)

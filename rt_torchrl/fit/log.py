@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.fit.sensors import known_sensors
+from rt_torchrl.loading import of_extra
 from rt_torchrl.options import OTHER_UNITS, Positive, configuration
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -326,8 +327,4 @@ def pandas() -> Any:
     Raises:
         ValueError: if it is not installed.
     """
-    try:
-        import pandas
-    except ImportError as error:
-        raise ValueError("logs need pandas: install the extra, pip install 'rt_torchrl[logs]'.") from error
-    return pandas
+    return of_extra("pandas", "logs")

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from rt_torchrl.loading import of_extra
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import ForeignSystem
@@ -285,9 +286,5 @@ class FMUEnvironment(ForeignSystem):
 
 
 def _fmpy() -> Any:
-    try:
-        import fmpy
-        import fmpy.simulation
-    except ImportError as error:
-        raise ValueError("FMUs need FMPy: install the extra, pip install 'rt_torchrl[fmu]'.") from error
-    return fmpy
+    of_extra("fmpy.simulation", "fmu")
+    return of_extra("fmpy", "fmu")

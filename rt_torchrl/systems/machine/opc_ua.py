@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
+from rt_torchrl.loading import of_extra
 from rt_torchrl.options import require_range
 from rt_torchrl.systems.machine.connected_plant import LONGEST, LateAnswerError, LinkLostError, RefusedRequestError
 
@@ -43,17 +44,15 @@ class OpcUaLink:
         timeout: longest time of an answer [s]; a fraction of the control period.
 
     Raises:
-        ValueError: if the time is none of an answer.
+        ValueError: if asyncua is not installed, or the time is none of an answer.
     """
 
     def __init__(
         self, client: Callable[..., Any], read: Mapping[str, str], written: Mapping[str, str], *, timeout: float
     ):
-        import asyncua.sync  # here, because the package is an extra
-
         require_range("timeout", timeout, *LONGEST, unit="s", of="the link")
-        self._ua: Any = asyncua.ua
-        self._thread, self._make_client = asyncua.sync.ThreadLoop, client
+        self._ua: Any = of_extra("asyncua.ua", "machine")
+        self._thread, self._make_client = of_extra("asyncua.sync", "machine").ThreadLoop, client
         self._read, self._written, self.timeout = dict(read), dict(written), timeout
         self.quality: dict[str, str] = {}
         self._loop: Any = None  # asyncua's thread with its event loop
