@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -108,6 +109,14 @@ class Stopped(Arm):
         stop = (2e4 * beyond + 20.0 * state[..., 3] * (beyond != 0.0)).unsqueeze(-1)
         rate = super().vector_field(t, state, action, exogenous, closure)
         return torch.cat([rate[..., :3], rate[..., 3:] - stop], -1)
+
+
+class Shaken(Pendulum):
+    """A pendulum whose foot shakes, which its twin does not know."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rate = super().vector_field(t, state, action, exogenous, closure)
+        return torch.stack([rate[..., 0], rate[..., 1] + 20.0 * torch.sin(3.0 * t)], -1)
 
 
 class Servo(rt.ClassicalController):
@@ -217,6 +226,12 @@ def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
     assert words in str(raised.value) and f"{plant.states[0].unit}, predicted to" in str(raised.value)
 
 
+@pytest.mark.parametrize("name", ["torque has the other sign", "torque does not arrive"])
+def test_a_mistake_that_noise_hides_in_one_interval_shows_over_several(name):
+    plant, wiring, words = MISTAKES[name]
+    assert words in rt.check_real_system(wired(plant, noise=0.01, **wiring), plant).mistakes[0]
+
+
 RIGHT = [(PENDULUM, 0.0), (PENDULUM, 0.01), (TURBINE, 0.0), (TANK, 0.0)]
 RIGHT += [pytest.param(plant, 0.01, marks=pytest.mark.slow) for plant in (TURBINE, TANK)]
 
@@ -246,11 +261,17 @@ def test_dynamics_that_the_twin_lacks_are_no_mistake(name):
 
 
 def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_and_share():
-    check = rt.check_real_system(wired(LEVELS, noise=0.05), LEVELS)
-    share = check.present.share[0].item()
+    check = rt.check_real_system(wired(PENDULUM, real=Shaken(horizon=5.0)), PENDULUM)
+    share = check.present.share[1].item()
     assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
-    with pytest.warns(UserWarning, match=f"the twin leaves {100.0 * share:.3g} % of level_1, .* unexplained: noise of"):
+    with pytest.warns(UserWarning, match=f"leaves .*{100.0 * share:.3g} % of speed unexplained, which is no"):
         check.require()
+
+
+def test_noise_of_sensors_is_said_and_no_warning():
+    check = rt.check_real_system(wired(LEVELS, noise=0.05), LEVELS)
+    assert check.present.share.max() > 0.2 and check.noise.all() and not check.doubts
+    assert str(check).count("% unexplained, which is noise of its sensor\n") == 4
 
 
 def test_a_start_far_from_what_the_plant_draws_is_a_warning():
@@ -260,6 +281,13 @@ def test_a_start_far_from_what_the_plant_draws_is_a_warning():
     with pytest.warns(UserWarning, match="state angle_2 is read at the start between 1.5.* draws 0.00.* a wrong zero"):
         check.require()
     rt.check_real_system(wired(ARM), ARM).require()
+
+
+def test_a_warning_of_a_far_start_names_a_unit_with_which_it_fits():
+    """Without torque the equations of the arm are linear, and hold in any unit."""
+    check = rt.check_real_system(wired(ARM, scale=TURN), ARM, spread=0.0)
+    assert not check.mistakes and len(check.doubts) == 4
+    assert all(re.search(r"draws [^:]*: in deg(/s)?, where the plant has rad", doubt) for doubt in check.doubts)
 
 
 @pytest.mark.parametrize(
@@ -322,7 +350,7 @@ def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_
 def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
     config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
     with pytest.warns(UserWarning, match="the twin leaves"):
-        metrics = rt.Run(config, PENDULUM, env=wired(PENDULUM, noise=0.5)).train()
+        metrics = rt.Run(config, PENDULUM, env=wired(PENDULUM, real=Shaken(horizon=5.0))).train()
     (doubt,) = metrics["episodes"][0]["doubts"]
     for note in ("neighbouring residuals of angle (0.9) are alike", ""):  # without one the residuals are noise
         metrics["summary"]["twin"]["note"] = note

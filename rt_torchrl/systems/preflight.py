@@ -7,8 +7,9 @@ state, :math:`\hat s_{k+1} = \Phi(s_k, a_k, z_k)`, and what it leaves unexplaine
 
 The coefficients of the closure are fitted first, so that ordinary model error counts as little as it can. If too much
 is left, the same is done for every mistake of a list. One that leaves much less, :math:`\sum_i \log q_i` lower by
-``MARGIN``, is named. A large share that no mistake explains is a warning and no refusal, because noise of sensors and
-dynamics that the twin lacks leave up to all of the movement unexplained, too.
+``MARGIN``, is named. Where sensors have noise, the same is done of predictions over more intervals: noise stays as
+large as it is, while the movement grows. A large share that no mistake explains is a warning and no refusal, because
+noise of sensors and dynamics that the twin lacks leave up to all of the movement unexplained, too.
 """
 
 import copy
@@ -17,16 +18,16 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.nn.utils import vector_to_parameters
 from torchrl.envs import EnvBase
 
+from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
@@ -40,7 +41,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 STARTS, INTERVALS = 3, 40
 """Number of starts, and of control intervals after each."""
 ROWS = 200
-"""Greatest number of intervals of a record that are looked at."""
+"""Greatest number of windows of a record that are looked at."""
 EXPLAINED = 3e-3
 """Share of the movement of a state that a twin with fitted coefficients may leave unexplained without a question."""
 DOUBTFUL = 0.2
@@ -51,6 +52,10 @@ FLOOR = 3e-4
 """Share below which a prediction counts as exact, whatever the digits of sensors and integrators."""
 MARGIN = math.log(8.0)
 """Least gain of a mistake that is named, and by how much it must be ahead of others to be named alone."""
+LENGTHS, ALTERNATING = (4, 20), -0.3
+"""Numbers of control intervals of further predictions where sensors have noise, which hides in one interval what shows
+over many; and correlation of the errors of neighbouring intervals below which they are noise: that of white noise is
+−a/(1 + a²), where the state of an interval depends on the one before by the factor a."""
 WORSE = 1.02
 """Share of a state that a mistake may leave, over that which the present wiring leaves."""
 LARGE, WORST = 1e3, 1e6
@@ -89,10 +94,10 @@ class Flown(NamedTuple):
 
     t: Float[Tensor, " n"]
     states: Float[Tensor, "n n_s"]
-    actions: Float[Tensor, "n n_a"]
-    exogenous: Float[Tensor, "n n_z"]
+    actions: Float[Tensor, "n length n_a"]
+    exogenous: Float[Tensor, "n length n_z"]
     ends: Float[Tensor, "n n_s"]
-    earlier_actions: Float[Tensor, "n n_a"]
+    earlier_actions: Float[Tensor, "n length n_a"]
     ratio: float = 1.0
     signs: Float[Tensor, " n_s"] | float = 1.0
 
@@ -116,6 +121,7 @@ class Wiring(NamedTuple):
         plant: plant that gives the states.
         moved: RMS movement of each state in an interval, in its unit.
         present: what the wiring as it is leaves unexplained.
+        noise: whether what is left of a state is noise of its sensor.
         mistakes: the readings that are wrong by themselves, of which no other wiring is tried: a state that stands
             still where the twin moves, two signals with the same readings, an input far outside its draws; or the
             mistakes that fit much better, the best one first. Empty if the wiring is right or nothing fits.
@@ -125,13 +131,16 @@ class Wiring(NamedTuple):
     plant: Plant
     moved: Float[Tensor, " n_s"]
     present: Unexplained
+    noise: Bool[Tensor, " n_s"]
     mistakes: tuple[str, ...]
     doubts: tuple[str, ...]
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
-        for signal, moved, share, error in zip(self.plant.states, self.moved, *self.present, strict=True):
+        columns = (self.moved, *self.present, self.noise)
+        for signal, moved, share, error, noise in zip(self.plant.states, *columns, strict=True):
             explained = f"{100.0 * share:.3g} % unexplained" if share.isfinite() else "it does not move"
+            explained += ", which is noise of its sensor" if noise else ""
             rows.append(f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted to {error:.4g}; {explained}")
         rows += [f"  mistake: {mistake}" for mistake in self.mistakes] or ["  no mistake explains the readings better"]
         return "\n".join([*rows, *(f"  {doubt}" for doubt in self.doubts)])
@@ -184,7 +193,7 @@ def check_real_system(
     noise = ExplorationConfig(spread=spread, correlation_time=CORRELATION * plant.dt)
     live = LivePolicy(plant, policy, noise, generator=generator).to(env.device)
     act = TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
-    parts: list[Flown] = []
+    parts: list[Trajectory] = []
     kept = env.state_dict()
     try:
         for _ in range(STARTS):
@@ -193,34 +202,38 @@ def check_real_system(
             for first, last in sound_part(episode, plant, None).parts:
                 part = episode[first:last]
                 states = torch.cat([part["state"], part["next", "state"][-1:]])
-                record = Trajectory(states, part["next", "applied"], part["exogenous"], first * plant.dt)
-                parts.append(_rows(record, plant, INTERVALS))
+                parts.append(Trajectory(states, part["next", "applied"], part["exogenous"], first * plant.dt))
     finally:
         env.load_state_dict(kept)
     if not parts:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    columns: list[Any] = [torch.cat(column) for column in list(zip(*parts, strict=True))[:6]]
-    return _checked(Flown(*columns), plant, closure)
+    return _checked(parts, plant, closure)
 
 
 def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
     """The same of a flight that has been flown, such as the first one of a training."""
-    return _checked(_rows(record, plant, ROWS), plant, closure)
+    return _checked([record], plant, closure)
 
 
-def _rows(record: Trajectory, plant: Plant, count: int) -> Flown:
-    """So many intervals of a record, if it has them, and all of the first ones."""
-    n = len(record.actions)
-    rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, count)).long()]).unique()
-    t = float(record.start) + plant.dt * rows.double()
-    states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
-    return Flown(t, states[rows], actions[rows], exogenous[rows], states[rows + 1], actions[(rows - 1).clamp(min=0)])
+def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
+    """Windows of so many control intervals of records: ``ROWS`` of each, if it has them, and all of the first ones."""
+    parts = []
+    for record in records:
+        n = len(record.actions) - length + 1
+        if n > 0:
+            rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, ROWS)).long()]).unique()
+            t, each = float(record.start) + plant.dt * rows.double(), rows[:, None] + torch.arange(length)
+            states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
+            ends, earlier = states[rows + length], actions[(each - 1).clamp(min=0)]
+            parts.append((t, states[rows], actions[each], exogenous[each], ends, earlier))
+    t, states, actions, exogenous, ends, earlier = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Flown(t, states, actions, exogenous, ends, earlier)
 
 
-def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
-    fit = _Fit(copy.deepcopy(plant).cpu(), closure)
+def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) -> Wiring:
+    fit, flown = _Fit(copy.deepcopy(plant).cpu(), closure), _windows(records, plant, 1)
     present, (moved, moves) = fit.unexplained(flown), fit.movement(flown)
-    explained = not (present.share > EXPLAINED).any()
+    explained, noise = not (present.share > EXPLAINED).any(), torch.zeros_like(moves)
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
     mistakes = [
         f"the reading of state {signal.name} stands still, and the twin moves"
@@ -234,30 +247,41 @@ def _checked(flown: Flown, plant: Plant, closure: nn.Module) -> Wiring:
         # More coefficients than readings would explain anything.
         mistakes = _better(fit, first, wholly=True) if first.ends.numel() > len(fit.guess) else []
         mistakes = mistakes or _better(fit, flown)
-    return Wiring(plant, moved, present, tuple(mistakes), () if mistakes else tuple(_doubts(plant, present, flown)))
+        noise = fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1))
+        for length in LENGTHS if noise.any() else ():
+            if not mistakes and 2 * length <= max(len(record.actions) for record in records):
+                mistakes = _better(fit, _windows(records, plant, length))
+    doubts = [] if mistakes else _doubts(plant, torch.where(noise, 0.0, present.share), flown)
+    return Wiring(plant, moved, present, noise, tuple(mistakes), tuple(doubts))
 
 
-def _doubts(plant: Plant, present: Unexplained, flown: Flown) -> Iterator[str]:
+def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterator[str]:
     """What no mistake explains and may be right all the same."""
-    shares = zip(plant.states, present.share.tolist(), strict=True)
+    shares = zip(plant.states, share.tolist(), strict=True)
     if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
         yield (
-            f"the twin leaves {', '.join(much)} unexplained: noise of a sensor, dynamics that the twin lacks, such as "
-            "a stop, or a mistake in a Reading, an Actuation or the plant's equations"
+            f"the twin leaves {', '.join(much)} unexplained, which is no white noise of a sensor: dynamics that the "
+            "twin lacks, such as a stop, or a mistake in a Reading, an Actuation or the plant's equations"
         )
     drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
     for signal, draws, read in zip(plant.states, drawn.T, flown.states[flown.t == 0.0].T, strict=True):
         if len(read) and _outside(draws, read, widths=0.5):
+            fitting = [
+                words
+                for words, scale, offset in _other_scales(signal.unit, FACTORS)
+                if not _outside(draws, offset + scale * read, widths=0.5)
+            ]
             yield (
-                f"state {signal.name} is read at the start {_beside(signal, read, draws)}: a wrong zero, or other "
-                "starts than those that plans are made for"
+                f"state {signal.name} is read at the start {_beside(signal, read, draws)}: "
+                f"{''.join(f'{words}, ' for words in fitting[:1])}a wrong zero, or other starts than those that plans "
+                "are made for"
             )
 
 
 def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
     """Which states have the readings of an input, or of another state if the twin does not move as they do."""
     signals = [f"state {signal.name}" for signal in plant.states] + [f"input {signal.name}" for signal in plant.inputs]
-    readings = torch.cat([flown.states, flown.exogenous], -1)
+    readings = torch.cat([flown.states, flown.exogenous[:, 0]], -1)
     for k, m in itertools.combinations(range(len(signals)), 2):
         alike = torch.equal(readings[:, k], readings[:, m]) and bool((readings[:, k] != readings[0, k]).any())
         if alike and k < len(plant.states) and not (explained and m < len(plant.states)):
@@ -336,6 +360,13 @@ class _Fit:
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
         return Unexplained(share, error.sqrt())
 
+    def noise(self, flown: Flown) -> Bool[Tensor, " n_s"]:
+        """Whether the errors of a state in neighbouring intervals alternate, as those by noise of its sensor do."""
+        errors = self._errors(flown, self._fitted(flown, EVALUATIONS) if self._weights else self.guess)[0]
+        neighbours = (flown.t.diff() - self.plant.dt).abs() < 0.5 * self.plant.dt
+        alike = (errors[1:] * errors[:-1])[neighbours].mean(0) / errors.square().mean(0)
+        return (self.unexplained(flown).share > EXPLAINED) & (alike < ALTERNATING)
+
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
         size = differences(self.plant.states, flown.ends, flown.states).square().mean(0).sqrt()
@@ -364,15 +395,17 @@ class _Fit:
     def _errors(self, flown: Flown, weights: Tensor) -> tuple[Float[Tensor, "n n_s"], Float[Tensor, "n n_s n_w"]]:
         """What is read less what is predicted, and the slopes of what is predicted by the coefficients."""
         if self._weights:
-            vector_to_parameters(weights, self._weights)
-        steps = max(1, round(flown.ratio))
-        inputs, actions = (values[:, None].expand(-1, steps, -1) for values in (flown.exogenous, flown.actions))
+            place(weights, self._weights)
+        duration = flown.ratio * flown.actions.shape[1]
+        steps = max(1, round(duration))
+        held = (torch.arange(steps) / flown.ratio).long()
+        inputs, actions = flown.exogenous[:, held], flown.actions[:, held]
         try:
             ends, slopes = self._twin.sensitivities(flown.states, inputs, actions, start=flown.t)
         except DivergenceError:
             nan = torch.full_like(flown.ends, torch.nan)
             return nan, nan[..., None].expand(-1, -1, len(weights))
-        share = flown.signs * torch.full((flown.states.shape[-1],), flown.ratio / steps, dtype=torch.float64)
+        share = flown.signs * torch.full((flown.states.shape[-1],), duration / steps, dtype=torch.float64)
         movement = share * differences(self.plant.states, ends[:, -1], flown.states)
         error = differences(self.plant.states, flown.ends - flown.states, movement)
         return error, share[:, None] * slopes[:, -1]
@@ -418,24 +451,28 @@ def _signal_mistakes(
         groups += [(f"all {what}s in {unit} are", unit, columns)] if len(columns) > 1 else []
     for subject, unit, columns in groups:
         yield f"{subject} negated", _changed(flown, names, columns, -1.0, 0.0)
-        others = OTHER_UNITS.get(unit, ())
-        for other, scale, offset in others:
-            words = f"{subject} in {other}, where the plant has {unit}"
-            yield words, _changed(flown, names, columns, scale, offset)
-        for factor in factors:
-            if all(not 0.5 < factor / scale < 2.0 for _, scale, _ in others):
-                words = f"{subject} read {1.0 / factor:g} times as large as it is"
-                yield words, _changed(flown, names, columns, factor, 0.0)
+        for words, scale, offset in _other_scales(unit, factors):
+            yield f"{subject} {words}", _changed(flown, names, columns, scale, offset)
     for k, m in itertools.combinations(range(len(signals)), 2):
         order = list(range(len(signals)))
         order[k], order[m] = m, k
-        swapped = {name: getattr(flown, name)[:, order] for name in names}
+        swapped = {name: getattr(flown, name)[..., order] for name in names}
         yield f"{what}s {signals[k].name} and {signals[m].name} are in the other order", flown._replace(**swapped)
+
+
+def _other_scales(unit: str, factors: Sequence[float]) -> Iterator[tuple[str, float, float]]:
+    """Other units of a signal and factors that are none of these in words, with scale and offset that mend them."""
+    others = OTHER_UNITS.get(unit, ())
+    for other, scale, offset in others:
+        yield f"in {other}, where the plant has {unit}", scale, offset
+    for factor in factors:
+        if all(not 0.5 < factor / scale < 2.0 for _, scale, _ in others):
+            yield f"read {1.0 / factor:g} times as large as it is", factor, 0.0
 
 
 def _changed(flown: Flown, names: tuple[str, ...], columns: list[int], scale: float, offset: float) -> Flown:
     """The flights with some columns changed to offset + scale·values."""
     changed = {name: getattr(flown, name).clone() for name in names}
     for values in changed.values():
-        values[:, columns] = offset + scale * values[:, columns]
+        values[..., columns] = offset + scale * values[..., columns]
     return flown._replace(**changed)
