@@ -9,6 +9,7 @@ import torch
 from torch import nn
 from traced_function import Snippet, compared, gap, marched, signals
 
+from rt_torchrl.programs import machine_code
 from rt_torchrl.programs.machine_code import Lanes, lanes_of_this_machine, march_text
 from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.trajectories.engines import native
@@ -88,6 +89,17 @@ def test_every_kind_of_lanes(lanes, width):
     torch.manual_seed(0)
     for found, exact in compared(Snippet(all_functions, net=nn.Linear(3, width)), *signals(11, 3), lanes=lanes):
         assert gap(found, exact) < 1e-12
+
+
+def test_a_text_that_is_too_long_for_optimisation_gives_the_same(monkeypatch, tmp_path):
+    torch.manual_seed(0)
+    case, lanes = (Snippet(all_functions, net=nn.Linear(3, 40)), *signals(11, 3)), lanes_of_this_machine()
+    optimised = compared(*case, lanes=lanes)
+    monkeypatch.setattr(machine_code, "LONG", 0)
+    monkeypatch.setattr(machine_code, "cache_folder", lambda: tmp_path)
+    for (found, exact), (other, _) in zip(compared(*case, lanes=lanes), optimised, strict=True):
+        assert gap(found, exact) < 1e-12 and gap(found, other) < 1e-15
+    assert list(tmp_path.iterdir())
 
 
 def test_the_text_compiles_for_other_processors():

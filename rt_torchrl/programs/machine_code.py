@@ -30,7 +30,9 @@ SMALL = 8
 """Size of arrays that always lie on the stack, from where LLVM takes them into registers."""
 X = "ptr noalias %x, i64 %first, i64 %last, i64 %row"
 """Parameters of functions that read a drive, see :func:`march_text`."""
-OPTIMISATION = 2
+OPTIMISATION, LONG = 2, 20_000
+"""Level at which LLVM optimises, and number of lines of a text beyond which it takes the code as it was written: its
+passes take minutes there, and save a tenth of the time of a run."""
 DIGEST = hashlib.sha256().digest_size
 _memory_of = (ctypes.c_char * 0).from_buffer  # four times faster than the array's own address
 INTRINSICS = {"abs": "fabs", "round": "rint"}
@@ -373,22 +375,24 @@ def cache_folder() -> Path:
 
 
 def _compile(text: str) -> bytes:
-    machine = _machine()
+    level = OPTIMISATION if text.count("\n") <= LONG else 1
+    machine = _machine(level)
     module = llvm.parse_assembly(text)
     module.verify()
-    options = llvm.create_pipeline_tuning_options(speed_level=OPTIMISATION)
-    options.slp_vectorization = options.loop_vectorization = False  # the lanes are the vectors
-    passes = llvm.create_pass_builder(machine, options)
-    passes.getModulePassManager().run(module, passes)
+    if level == OPTIMISATION:
+        options = llvm.create_pipeline_tuning_options(speed_level=level)
+        options.slp_vectorization = options.loop_vectorization = False  # the lanes are the vectors
+        passes = llvm.create_pass_builder(machine, options)
+        passes.getModulePassManager().run(module, passes)
     return bytes(machine.emit_object(module))
 
 
-def _machine() -> llvm.TargetMachine:
+def _machine(level: int = OPTIMISATION) -> llvm.TargetMachine:
     """A new description of this processor, because the code that is loaded with one frees it."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=OPTIMISATION, jit=True)
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, jit=True)
 
 
 @cache
