@@ -264,7 +264,7 @@ def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_an
     check = rt.check_real_system(wired(PENDULUM, real=Shaken(horizon=5.0)), PENDULUM)
     share = check.present.share[1].item()
     assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
-    with pytest.warns(UserWarning, match=f"leaves .*{100.0 * share:.3g} % of speed unexplained, which is no"):
+    with pytest.warns(UserWarning, match=f"leaves .*{100.0 * share:.3g} % of angular_speed unexplained, which is no"):
         check.require()
 
 
