@@ -28,6 +28,7 @@ import dataclasses
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -216,7 +217,7 @@ class ReinforcementTwinning(TensorDictSequential):
             episode.set_non_tensor("live", self.referee.live)
         steps: dict[str, Callable[[TensorDictBase], TensorDictBase]] = dict(self.module.items())
         if self.first is not None and not self.episodes_done:
-            steps = {"start": self.start} | steps
+            steps = {"start": partial(self.start, tell=tell)} | steps
         self.flights.faults = []
         for name, step in steps.items():
             safe_point()
@@ -226,7 +227,9 @@ class ReinforcementTwinning(TensorDictSequential):
             episode["seconds", name] = time.perf_counter() - start
         return episode
 
-    def start(self, episode: TensorDictBase | None = None) -> TensorDictBase:
+    def start(
+        self, episode: TensorDictBase | None = None, *, tell: Callable[[str], None] = lambda part: None
+    ) -> TensorDictBase:
         """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
         assert self.first is not None
         episode = TensorDict() if episode is None else episode
@@ -247,8 +250,10 @@ class ReinforcementTwinning(TensorDictSequential):
             if on_twin:
                 self.virtual.learn(flight.record)
         if on_twin:
+            tell("fit")
             self.steps["assimilate"].fit(records)
             self.assimilation.explain(self.belief.replayed(records, counted), self.generator)
+        tell("imitation")
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)
         report = imitation.begin(self.first.teacher, imitating, flown)

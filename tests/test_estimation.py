@@ -110,7 +110,7 @@ def test_what_one_sensor_cannot_tell_is_said():
     records = [r._replace(readings=r.readings + 0.01 * torch.randn(51, 1, generator=generator)) for r in records]
     found = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors).run(records)
     # The force enters ẍ with a known factor, so that the scale is known and only β is free.
-    (message,) = (text for text in found.uncertainty.warnings() if "do not tell" in text)
+    (message,) = (text for text in found.uncertainty.warnings() if "at most combinations" in text)
     assert "matrix[0,0], matrix[1,0], matrix[1,1]" in message
     unknown = [name for name, error in found.uncertainty.standard_errors().items() if math.isinf(error)]
     assert unknown == ["matrix[0,0]", "matrix[1,0]", "matrix[1,1]"]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import time
 from unittest.mock import Mock
 
 import pytest
@@ -85,7 +86,27 @@ def test_weights_are_shown_with_what_is_known_of_them():
 def test_it_names_each_step_as_it_begins():
     told = []
     twinning().episode(told.append)
-    assert told == STEPS and set(dashboard.WORDS) == {"start", *STEPS}
+    assert told == STEPS and set(dashboard.WORDS) == {"start", "fit", "imitation", *STEPS}
+
+
+def test_a_log_names_a_step_that_lasts(monkeypatch, capsys):
+    monkeypatch.setattr(dashboard, "QUIET", 0.2)
+    with Progress(1) as bar:
+        for step in ("interact", "learn", "plan"):
+            bar.doing(step)
+        time.sleep(0.6)
+    assert capsys.readouterr().err.splitlines() == ["real episode", "planning"]
+
+
+def test_the_table_says_why_a_policy_is_live_and_what_the_other_half_gave():
+    episodes = [{"episode": 1, "event": "clone", "update_accepted": 0.0}]
+    episodes += [{"episode": 2, "event": "swap", "update_accepted": 1.0}]
+    episodes[-1] |= {"expected/model_free": 2.0, "expected/model_based": 2.5}
+    (line,) = results.live_lines("model_free", episodes)
+    assert line == (
+        "  live at the end: model-free, expected to cost 2 on the real system, and model-based 2.5; updates of "
+        "model-free that were kept: 1 of 2; the idle one became a clone after episode 1"
+    )
 
 
 def test_a_log_has_a_line_for_each_episode_and_for_what_changes_or_begins_after_a_while(monkeypatch, capsys):
@@ -149,14 +170,16 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     live = metrics["summary"]["live"]
     cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
 
-    def said(better, controller, planner="multi_start", place="simulation", **summary):
-        unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": {"J_a": {"mean": controller}}}}
+    def said(better, controller, planner="multi_start", place="simulation", greatest=0.9, **summary):
+        beside = {"J_a": {"mean": controller}, "ratio": {"confidence_interval": [0.9 * cost / controller, greatest]}}
+        unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": beside}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
         return results.next_steps({"summary": found}, tmp_path, config)
 
     first = {"expected": 3.0, "paid": 2.0}
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
+    assert "the live policy is not clearly better than PI: keep PI" in said(live, 1.1 * cost, greatest=1.01)
     other = "model_free" if live == "model_based" else "model_based"
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
     told = said(live, 2.0 * cost, place="twin", first=first)

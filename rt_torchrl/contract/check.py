@@ -49,7 +49,7 @@ class ContractReport(NamedTuple):
     untraceable: str | None = None
 
     def __str__(self) -> str:
-        accuracy = "" if self.step_error is None else f"; a step errs by {100 * self.step_error:.1g} % of its move"
+        accuracy = "" if self.step_error is None else f"; a step errs by {100 * self.step_error:.2g} % of its move"
         engine = f"; engine 'autograd' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
         return f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}{accuracy}{engine}"
 

@@ -35,7 +35,7 @@ from rt_torchrl.fit.likelihood import Likelihood
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
-"""Standard error of a value, as a share of the value, above which the data hardly tell it."""
+"""Standard error of a value, as a share of the value, above which the data do not tell it from zero."""
 HIGH_CORRELATION = 0.99
 """Correlation of two values above which the data tell only one combination of them."""
 LEAST_EIGENVALUE = 1e-12
@@ -133,7 +133,9 @@ class Uncertainty:
             )
         for (name, error), value in zip(errors.items(), self.values.tolist(), strict=True):
             if not math.isinf(error) and error > BAD_SHARE * abs(value):
-                warnings.append(f"the data hardly tell {name}: {value:.3g} with a standard error of {error:.2g}")
+                warnings.append(
+                    f"the data do not tell {name} from zero: {value:.3g} with a standard error of {error:.2g}"
+                )
         R = self.correlations()
         for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():  # nan for those that are not told
             warnings.append(

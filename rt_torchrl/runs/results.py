@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
 from rt_torchrl.fit.least_squares import not_white
+from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
@@ -24,6 +25,7 @@ from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.report import in_words
+from rt_torchrl.steps.switch import other_than
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -125,6 +127,7 @@ def summarise(
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
         "twin": fit_of(algorithm),
+        "network": any(isinstance(part, nn.Linear) for part in closure.modules()),
         "hypotheses": hypotheses_of(algorithm.twin),
         "believed": algorithm.twin.hypothesis,
     }
@@ -134,22 +137,46 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     """How the believed twin replays the records that it was last fitted to.
 
     ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
-    0; ``noise`` the noise of the sensors; ``standard_errors`` those of the closure's coefficients, and ``note`` what
-    these do not hold, in words.
+    0; ``noise`` the noise of the sensors; ``standard_errors`` those of the closure's coefficients, ``correlations`` of
+    these beyond 0.9, the greatest ones first, ``note`` what the standard errors do not hold, in words, and ``covered``
+    the least and the greatest value of each state in the records, by ``STATE [UNIT]``.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
-        return {"rms": {}, "segment": 0, "noise": {}, "standard_errors": {}, "note": ""}
-    levels = zip(algorithm.twin.plant.readings, algorithm.twin.noise.tolist(), strict=True)
+        return {
+            "rms": {},
+            "segment": 0,
+            "noise": {},
+            "standard_errors": {},
+            "correlations": {},
+            "note": "",
+            "covered": {},
+        }
+    plant = algorithm.twin.plant
+    levels = zip(plant.readings, algorithm.twin.noise.tolist(), strict=True)
+    sensors = [(signal, level) for signal, level in levels if level and signal.name not in plant.controller_states]
     latest, _ = algorithm.virtual.paired(records)
     uncertainty = assimilation.uncertainty(latest)
     return {
         "rms": assimilation.rms_errors(latest),
         "segment": assimilation.length,
-        "noise": {f"{signal.name} [{signal.unit}]": level for signal, level in levels if level},
+        "noise": {f"{signal.name} [{signal.unit}]": level for signal, level in sensors},
         "standard_errors": {} if uncertainty is None else uncertainty.standard_errors(),
+        "correlations": {} if uncertainty is None else high_correlations(uncertainty),
         "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
+        "covered": {
+            f"{signal.name} [{signal.unit}]": [course.min().item(), course.max().item()]
+            for signal, course in zip(plant.readings, torch.cat([record.states for record in latest]).T, strict=True)
+        },
     }
+
+
+def high_correlations(uncertainty: Uncertainty) -> dict[str, float]:
+    """Correlations of the errors of two coefficients beyond ``HIGH_CORRELATION``, the greatest ones first."""
+    R, names = uncertainty.correlations(), uncertainty.names  # nan for those of which the data say nothing
+    pairs = (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist()
+    found = {f"{names[i]} and {names[j]}": R[i, j].item() for i, j in pairs}
+    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
 
 @torch.no_grad()
@@ -223,6 +250,8 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
 
 MOST_WEIGHTS = 12
 """Greatest number of weights of the closure that the table shows."""
+HIGH_CORRELATION, MOST_CORRELATIONS = 0.9, 3
+"""Correlation of the errors of two coefficients that the results name, and greatest number that the table shows."""
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
@@ -284,9 +313,9 @@ def results_table(metrics: dict[str, Any]) -> str:
     whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     after = f", {len(paid['judging'])} of them after the training" if "judging" in paid else ""
     lines.append(
-        f"  live at the end: {summary['live'].replace('_', '-')}; paid on the real system: sum of J_a {whole} over "
-        f"{paid['episodes']} episodes{after}, largest {most}"
+        f"  paid on the real system: sum of J_a {whole} over {paid['episodes']} episodes{after}, largest {most}"
     )
+    lines += live_lines(summary["live"], episodes)
     lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
     # A fit whose residuals are noise has answered the doubts of the first flight.
@@ -295,9 +324,27 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += alarm_lines(episodes)
     lines += fit_lines(fitted)
     lines += closure_lines(summary["closure"], fitted["standard_errors"])
+    if summary["network"] and fitted["covered"]:
+        ranges = [f"{label}: {low:.3g} to {high:.3g}" for label, (low, high) in fitted["covered"].items()]
+        where = ", ".join(ranges[:MOST_WEIGHTS])
+        lines.append(f"  what a network of the twin has learned holds where its last records went: {where}")
+    if high := [f"{pair} {value:.3f}" for pair, value in fitted["correlations"].items()][:MOST_CORRELATIONS]:
+        lines.append(f"  correlation of errors: {', '.join(high)}")
     lines += [f"  {note}" for note in [fitted["note"]] if note]
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in summary["seconds"].items()))
     return "\n".join(lines)
+
+
+def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines with the policy that is live at the end, what both are expected to cost, and what each half gave."""
+    line, last = f"  live at the end: {live.replace('_', '-')}", episodes[-1]
+    if f"expected/{live}" in last:
+        cost, other = (_number(last[f"expected/{role}"], ".4g") for role in (live, other_than(live)))
+        line += f", expected to cost {cost} on the real system, and {other_than(live).replace('_', '-')} {other}"
+    judged = [record["update_accepted"] for record in episodes if "update_accepted" in record]
+    line += f"; updates of model-free that were kept: {sum(judged):.0f} of {len(judged)}" if judged else ""
+    clones = [record["episode"] for record in episodes if record["event"] == "clone"]
+    return [line + (f"; the idle one became a clone after episode {clones[-1]}" if clones else "")]
 
 
 def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
@@ -427,6 +474,14 @@ def dearer_than_first(summary: Mapping[str, Any]) -> str:
     )
 
 
+def clearly_cheaper(summary: Mapping[str, Any], name: str) -> bool:
+    """Whether the live policy costs less than a controller in the same episodes, with 95 % confidence."""
+    flown = summary.get("real_unseen", {}).get("controllers", {})
+    judged = flown if summary["live"] in flown else summary["unseen"]["baselines"]
+    greatest = judged[name]["ratio"]["confidence_interval"][1]
+    return greatest is not None and greatest < 1.0
+
+
 def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
@@ -444,6 +499,11 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
+    elif best is not None and cost < known[best] and not clearly_cheaper(summary, best):
+        steps.append(
+            f"the live policy is not clearly better than {best}: keep {best}, let the policy observe what {best} "
+            "computes, or judge both in more episodes (--unseen, on a real system --real-unseen)"
+        )
     elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
         better = best if best is not None and cost >= known[best] else "the controller that flew first"
         other = "let the policy observe what that controller computes, or train with more --twinning.planner.iterations"

@@ -141,7 +141,7 @@ class Switch(Step):
     """Step 6: the referee decides by what both policies cost over the same N virtual episodes.
 
     Reads ``live``, ``record`` and the relative ``weight_changes`` of both policies. Writes ``event``,
-    ``J_a_model_based`` and ``J_a_model_free`` on the twin.
+    ``J_a_model_based`` and ``J_a_model_free`` on the twin, and reports what both are ``expected`` to cost.
 
     Args:
         referee: the referee.
@@ -174,8 +174,10 @@ class Switch(Step):
         # Weights whose step was left out, because the twin diverged, are as they were.
         change = float(episode.get(("weight_changes", idle), 0.0))
         event = self.referee.decide(Evidence(costs[live].expected, costs[idle].expected, change))
-        on_twin = {f"J_a_{role}": costs[role].on_twin for role in ROLES}
-        report = metrics(*diverged, **on_twin, weight_change=change, event=event)
+        entries = {f"J_a_{role}": costs[role].on_twin for role in ROLES}
+        if belief.corrects:
+            entries |= {f"expected/{role}": costs[role].expected for role in ROLES}
+        report = metrics(*diverged, **entries, weight_change=change, event=event)
         if event == "clone":
             policies, record = (belief.policies[live], belief.policies[idle]), record_of(episode)
             if episode["live"] != live:  # another one flew, whose actions say nothing of this one
