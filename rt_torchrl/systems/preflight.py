@@ -52,18 +52,19 @@ FLOOR = 3e-4
 """Share below which a prediction counts as exact, whatever the digits of sensors and integrators."""
 MARGIN = math.log(8.0)
 """Least gain of a mistake that is named, and by how much it must be ahead of others to be named alone."""
-LENGTHS, ALTERNATING = (4, 20), -0.3
+LENGTHS, ALTERNATING = (4, 20), 2.0
 """Numbers of control intervals of further predictions where sensors have noise, which hides in one interval what shows
-over many; and correlation of the errors of neighbouring intervals below which they are noise: that of white noise is
-−a/(1 + a²), where the state of an interval depends on the one before by the factor a."""
+over many; and how many standard errors the correlation of the errors of neighbouring intervals is below zero where
+they are noise: that of white noise is −a/(1 + a²), if a state depends on the one before by the factor a."""
 WORSE = 1.02
 """Share of a state that a mistake may leave, over that which the present wiring leaves."""
 LARGE, WORST = 1e3, 1e6
 """Error, in movements, and share that stand for a prediction that is not finite."""
 EVALUATIONS, QUICK = 12, 4
 """Greatest number of evaluations in a fit of the coefficients, and in the first one of each mistake."""
-FITTED = 12
-"""Number of mistakes, the best ones after their first fit, to which the coefficients are fitted."""
+LIKELY, FITTED = 60, 12
+"""Number of mistakes, the best ones after their first fit, that are tried over more intervals, and to which the
+coefficients are fitted: twenty states may be wired wrongly in five hundred ways."""
 EARLY = 6
 """First intervals of a flight that are looked at alone: feedback through a mistake may drive the system into a stop."""
 RATIOS = (0.1, 0.2, 0.25, 0.4, 0.5, 2.0, 2.5, 4.0, 5.0, 10.0)
@@ -216,12 +217,16 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
 
 
 def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
-    """Windows of so many control intervals of records: ``ROWS`` of each, if it has them, and all of the first ones."""
+    """Windows of so many control intervals of records: ``ROWS`` of each, if it has them, and all of the first ones.
+
+    Each begins in the middle of the one before.
+    """
     parts = []
     for record in records:
         n = len(record.actions) - length + 1
         if n > 0:
-            rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, min(n, ROWS)).long()]).unique()
+            count = min(ROWS, -(-n // max(1, length // 2)))
+            rows = torch.cat([torch.arange(min(n, EARLY)), torch.linspace(0, n - 1, count).long()]).unique()
             t, each = float(record.start) + plant.dt * rows.double(), rows[:, None] + torch.arange(length)
             states, actions, exogenous, *_ = record.mapped(lambda values: values.detach().cpu())
             ends, earlier = states[rows + length], actions[(each - 1).clamp(min=0)]
@@ -233,7 +238,7 @@ def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
 def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) -> Wiring:
     fit, flown = _Fit(copy.deepcopy(plant).cpu(), closure), _windows(records, plant, 1)
     present, (moved, moves) = fit.unexplained(flown), fit.movement(flown)
-    explained, noise = not (present.share > EXPLAINED).any(), torch.zeros_like(moves)
+    explained, noise, share = not (present.share > EXPLAINED).any(), torch.zeros_like(moves), present.share
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
     mistakes = [
         f"the reading of state {signal.name} stands still, and the twin moves"
@@ -244,14 +249,21 @@ def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) ->
     if not mistakes and not explained:
         early = flown.t < (EARLY - 0.5) * plant.dt
         first = flown._replace(**{name: getattr(flown, name)[early] for name in Flown._fields[:6]})
-        # More coefficients than readings would explain anything.
-        mistakes = _better(fit, first, wholly=True) if first.ends.numel() > len(fit.guess) else []
-        mistakes = mistakes or _better(fit, flown)
-        noise = fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1))
+        noise, likely = (
+            fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1)),
+            list[str](),
+        )
+        # More coefficients than readings would explain anything, and noise leaves nothing that is explained wholly.
+        if first.ends.numel() > len(fit.guess) and not noise.any():
+            mistakes, _ = _better(fit, first, wholly=True)
+        if not mistakes:
+            mistakes, likely = _better(fit, flown)
         for length in LENGTHS if noise.any() else ():
             if not mistakes and 2 * length <= max(len(record.actions) for record in records):
-                mistakes = _better(fit, _windows(records, plant, length))
-    doubts = [] if mistakes else _doubts(plant, torch.where(noise, 0.0, present.share), flown)
+                windows = _windows(records, plant, length)
+                mistakes, _ = _better(fit, windows, among=likely)
+                share = fit.unexplained(windows).share
+    doubts = [] if mistakes else _doubts(plant, torch.where(noise, 0.0, share), flown)
     return Wiring(plant, moved, present, noise, tuple(mistakes), tuple(doubts))
 
 
@@ -311,8 +323,10 @@ def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:
     return width > 0.0 and max(low - read.min().item(), read.max().item() - high) > widths * width
 
 
-def _better(fit: "_Fit", flown: Flown, *, wholly: bool = False) -> list[str]:
-    """The mistakes that fit much better than the wiring as it is, one of a kind.
+def _better(
+    fit: "_Fit", flown: Flown, *, wholly: bool = False, among: Sequence[str] = ()
+) -> tuple[list[str], list[str]]:
+    """The mistakes, among all or some, that fit much better than the wiring as it is, one of a kind; and likely ones.
 
     A mistake in the reading of a state must leave at most half of that state, and others hardly more of any state than
     the present wiring. Where no error of the present wiring shows beside the size of its state, or with ``wholly``, a
@@ -320,11 +334,11 @@ def _better(fit: "_Fit", flown: Flown, *, wholly: bool = False) -> list[str]:
     """
     present = fit.unexplained(flown)
     if not (present.share > EXPLAINED).any():
-        return []
+        return [], []
     shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any() and not wholly
     enough = torch.where(present.share > 2.0 * EXPLAINED, 0.5 * present.share, EXPLAINED)
-    tried = []
-    ranked = sorted(_mistakes(fit.plant, flown), key=lambda pair: fit.unexplained(pair[1], QUICK).score)
+    tried, mistakes = [], [pair for pair in _mistakes(fit.plant, flown) if not among or pair[0] in among]
+    ranked = sorted(mistakes, key=lambda pair: fit.unexplained(pair[1], QUICK).score)
     for words, mended in ranked[:FITTED]:
         left = fit.unexplained(mended)
         changed = (mended.states != flown.states).any(0)
@@ -336,7 +350,7 @@ def _better(fit: "_Fit", flown: Flown, *, wholly: bool = False) -> list[str]:
     for score, words in tried:
         if score < min(present.score, tried[0][0] + 2.0 * MARGIN) - MARGIN:
             kinds.setdefault(re.split(",| (?:is|are) in ", words)[0], words)
-    return list(kinds.values())
+    return list(kinds.values()), [words for words, _ in ranked[:LIKELY]]
 
 
 class _Fit:
@@ -365,7 +379,8 @@ class _Fit:
         errors = self._errors(flown, self._fitted(flown, EVALUATIONS) if self._weights else self.guess)[0]
         neighbours = (flown.t.diff() - self.plant.dt).abs() < 0.5 * self.plant.dt
         alike = (errors[1:] * errors[:-1])[neighbours].mean(0) / errors.square().mean(0)
-        return (self.unexplained(flown).share > EXPLAINED) & (alike < ALTERNATING)
+        beyond = -ALTERNATING / max(1, int(neighbours.sum())) ** 0.5
+        return (self.unexplained(flown).share > EXPLAINED) & (alike < beyond)
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
