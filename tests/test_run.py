@@ -151,6 +151,11 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     assert torch.equal(whole.algorithm.generator.get_state(), resumed.algorithm.generator.get_state())
 
 
+def test_a_step_that_is_too_coarse_for_its_plant_is_a_warning_before_any_work(tmp_path):
+    with pytest.warns(UserWarning, match=r"step of dt=1.5 s of plant 'linear_quadratic' errs by 7\.\d\d% of its move"):
+        rt.Run(rt.RunConfig(log_dir=tmp_path), LinearQuadratic(dt=1.5, horizon=30.0))
+
+
 def test_an_unwritable_folder_and_a_plant_that_breaks_its_contract_are_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="log_dir=.*cannot be made"):

@@ -26,6 +26,8 @@ CORNER, JUMP = 1e-5, 1e-4
 """Least gap between the slopes of both sides of a corner, and least change of the value, in its size, of a jump."""
 SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exogenous": "inputs"}
 CHECKED = ("vector_field", "step", "running_cost", "terminal_cost", "observe")
+STILL = 1e-12
+"""Movement of a state, as a share of its size, that is rounding."""
 GROWTH = 1.0 + 1e-6
 """Factor per step above which a decaying mode counts as growing; that of an undamped mode is 1 to rounding."""
 
@@ -74,7 +76,8 @@ def step_error(calls: Calls) -> float | None:
     half, whole = 0.5 * plant.dt, step(t, state, plant.dt)
     errors = whole - step(t + half, step(t, state, half), half)
     errors, moves = (change.flatten(0, -2).abs().amax(0) for change in (errors, whole - state))
-    return float((errors / moves.clamp_min(1e-300)).max())
+    sizes = state.flatten(0, -2).abs().amax(0)  # what moves by rounding alone errs by as much
+    return float((errors / torch.maximum(moves, STILL * (1.0 + sizes))).max())
 
 
 def jacobian(plant: Plant, closure: nn.Module, arguments: Arguments) -> Tensor:

@@ -1,5 +1,6 @@
 """What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
 
+import warnings
 from pathlib import Path
 
 import torch
@@ -107,8 +108,9 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> RecordedFlights:
     return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
 
 
-CHECKED_STEPS = 10
-"""Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
+CHECKED_STEPS, COARSE = 10, 0.01
+"""Number of control intervals on which a plant is checked before a run, and share of its move by which a step may err
+without a warning; ``check_plant`` by itself checks more."""
 
 
 def known_physics(
@@ -138,7 +140,13 @@ def known_physics(
             "its extensions."
         )
     for model in filter(None, (plant, believed)):
-        check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics)
+        report = check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics)
+    if report.step_error is not None and report.step_error > COARSE:  # of the physics, which is the last one
+        warnings.warn(
+            f"a Runge-Kutta step of dt={physics.dt:g} s of plant {physics.name!r} errs by {report.step_error:.2%} of "
+            "its move, which a fit takes for one of the coefficients: use a smaller dt or an advance of several steps.",
+            stacklevel=3,
+        )
     controllers: dict[str, object] = {} if first is None else {"first": first}
     controllers |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
     for name, law in controllers.items():
