@@ -8,6 +8,7 @@ from test_algorithm import twinning
 from test_classical import PD
 
 from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig, RefereeConfig
+from rt_torchrl.runs.results import first_there
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.trajectories.trajectory import control_cost
 
@@ -136,6 +137,15 @@ def test_a_controller_whose_costs_have_no_ratio_is_named():
     # Nor does the twin alone know a controller.
     for each in (found, started(referee=RefereeConfig(rule="decision_tree"))[0]):
         assert each.belief.beside_first(each.model_based, each.first.teacher) is None
+
+
+def test_each_episode_says_what_the_controller_would_cost_there_on_the_twin():
+    found = begun(assimilation=AssimilationConfig(iterations=0))
+    found.twin.closure.load_state_dict(found.twin.plant.closure.state_dict())
+    found.episode()
+    record, (entry,) = found.short_term[-1], first_there(found).values()
+    flown = found.first.teacher.fly(record.states[:1], record.exogenous[None], found.twin.plant.closure)
+    assert entry == pytest.approx(control_cost(found.twin.plant, flown).item(), rel=1e-9)
 
 
 def test_a_run_begins_with_its_first_controller_once_and_knows_it_when_it_is_resumed(tmp_path, capsys):

@@ -27,6 +27,7 @@ from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.report import in_words
 from rt_torchrl.steps.switch import other_than
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -46,6 +47,21 @@ def episode_record(entries: TensorDict, *, episode: int) -> dict[str, Any]:
         else:
             record[key] = value if isinstance(value, str) else float(value)
     return record
+
+
+def first_there(algorithm: ReinforcementTwinning) -> dict[str, float]:
+    """``J_a_first`` of the controller that flew first: what it would cost in the last real episode, on the twin.
+
+    Real costs alone do not compare: starts and inputs make episodes dear that a policy flies well. It is left out of a
+    part of an episode, and of a controller that plans, whose episodes take too long.
+    """
+    controller = None if algorithm.first is None else algorithm.first.teacher
+    plans = isinstance(controller, StateFeedback) and not isinstance(controller, Remembering)
+    flown, virtual = algorithm.belief.flown[-1:], algorithm.belief.virtual
+    whole = flown and flown[0].trajectory is algorithm.short_term[-1]
+    if controller is None or plans or not whole or algorithm.config.arm == "model_free":
+        return {}
+    return {"J_a_first": virtual.cost(controller, virtual.repeated(flown[0].trajectory))}
 
 
 def twin_entries(twin: DigitalTwin) -> dict[str, Any]:
@@ -139,7 +155,7 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
     0; ``noise`` the noise of the sensors; ``standard_errors`` those of the closure's coefficients, ``correlations`` of
     these beyond 0.9, the greatest ones first, ``note`` what the standard errors do not hold, in words, and ``covered``
-    the least and the greatest value of each state in the records, by ``STATE [UNIT]``.
+    the least and the greatest value of each action, input and state in the records, by ``NAME [UNIT]``.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
@@ -166,7 +182,8 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
         "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
         "covered": {
             f"{signal.name} [{signal.unit}]": [course.min().item(), course.max().item()]
-            for signal, course in zip(plant.readings, torch.cat([record.states for record in latest]).T, strict=True)
+            for signals, name in ((plant.actions, "actions"), (plant.inputs, "exogenous"), (plant.readings, "states"))
+            for signal, course in zip(signals, torch.cat([getattr(record, name) for record in latest]).T, strict=True)
         },
     }
 
@@ -265,6 +282,7 @@ def progress(record: dict[str, Any]) -> str:
     """The costs of an episode and its live policy, as the progress bar shows them."""
     errors = {key.removeprefix("rms/"): value for key, value in record.items() if key.startswith("rms/")}
     named = {"J_a mb": "J_a_model_based", "J_a mf": "J_a_model_free", "real": "real_cost"}
+    named["there the first controller on the twin"] = "J_a_first"
     costs = [f"{name} {in_words(record[key])}" for name, key in named.items() if record.get(key) is not None]
     return ", ".join([*rms_words(errors)[:MOST_ERRORS], *costs, f"live {record['live'].replace('_', '-')}"])
 

@@ -277,7 +277,7 @@ class Run:
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         number = len(self.episodes) + 1
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=number)
-        record |= results.twin_entries(self.algorithm.twin)
+        record |= results.twin_entries(self.algorithm.twin) | results.first_there(self.algorithm)
         if self._doubts:
             record["doubts"], self._doubts = list(self._doubts), ()
         if self.algorithm.flights.faults:

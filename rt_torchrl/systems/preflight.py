@@ -402,7 +402,7 @@ class _Fit:
             change = -(slopes[weights.tobytes()] / size[:, None])[:, moves]
             return change.flatten(0, 1).nan_to_num(0.0, 0.0, 0.0).numpy()
 
-        with np.errstate(over="ignore"):  # of a mistake under which the twin explodes
+        with np.errstate(all="ignore"):  # of a mistake under which the twin explodes
             best = least_squares(residuals, self.guess.numpy(), jac=jacobian, max_nfev=evaluations)
         return torch.as_tensor(best.x)
 
