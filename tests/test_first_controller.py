@@ -146,6 +146,8 @@ def test_each_episode_says_what_the_controller_would_cost_there_on_the_twin():
     record, (entry,) = found.short_term[-1], first_there(found).values()
     flown = found.first.teacher.fly(record.states[:1], record.exogenous[None], found.twin.plant.closure)
     assert entry == pytest.approx(control_cost(found.twin.plant, flown).item(), rel=1e-9)
+    found.belief.first.clear()
+    assert not first_there(found)  # nothing flew before the policies, as where they have the weights of an earlier run
 
 
 def test_a_run_begins_with_its_first_controller_once_and_knows_it_when_it_is_resumed(tmp_path, capsys):

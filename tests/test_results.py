@@ -180,6 +180,14 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     first = {"expected": 3.0, "paid": 2.0}
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
     assert "the live policy is not clearly better than PI: keep PI" in said(live, 1.1 * cost, greatest=1.01)
+    for high in (0.8, 1.2):  # flights on a real system whose episodes are never the same
+        costs = {live: (1.0, high), "PI": (1.2, 1.3)}
+        flown = {
+            name: {"J_a": {"mean": mean, "confidence_interval": [0.7, end]}} for name, (mean, end) in costs.items()
+        }
+        flown["PI"]["J_a"]["confidence_interval"][0] = 1.1
+        told = said(live, 2.0 * cost, place="twin", real_unseen={"controllers": flown})
+        assert ("not clearly better than PI" in told) == (high > 1.1)
     other = "model_free" if live == "model_based" else "model_based"
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
     told = said(live, 2.0 * cost, place="twin", first=first)

@@ -44,14 +44,19 @@ def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str
     They are those of the flights on the real system, if the live policy has flown there, and else of unseen episodes: a
     cost on the twin is not compared with one on the real system.
     """
+    judged, where = judged_at_the_end(summary)
+    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
+    cost = means.pop(summary["live"])
+    return cost, {name: mean for name, mean in means.items() if mean is not None}, where
+
+
+def judged_at_the_end(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+    """What the live policy and classical controllers cost, by name, and where; see :func:`costs_at_the_end`."""
     unseen, live = summary["unseen"], summary["live"]
     flown = summary.get("real_unseen", {}).get("controllers", {})
-    judged, where = unseen["baselines"] | {live: {"J_a": unseen[f"J_a_{live}"]}}, unseen["judged_on"]
     if live in flown:
-        judged, where = dict(flown), "real system"
-    cost = judged.pop(live)["J_a"]["mean"]
-    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
-    return cost, {name: mean for name, mean in means.items() if mean is not None}, where
+        return flown, "real system"
+    return unseen["baselines"] | {live: {"J_a": unseen[f"J_a_{live}"]}}, unseen["judged_on"]
 
 
 def judged_on_the_system(summary: Mapping[str, Any]) -> Mapping[str, Any]:
