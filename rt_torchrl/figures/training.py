@@ -23,12 +23,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 CONTROL: dict[str, dict[str, Any]] = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},
-    "J_a_first": {
-        "color": "0.55",
-        "marker": "x",
-        "linestyle": ":",
-        "label": "first controller, twin",
-    },
+    "J_a_first": {"color": "0.55", "marker": "x", "linestyle": ":", "label": "first controller, twin"},
     "J_a_unseen": {"color": REAL, "marker": "*", "linestyle": ":", "label": "live, unseen"},
     "J_a_unseen_on_the_twin": {"color": TWIN, "marker": "*", "linestyle": ":", "label": "live, unseen, twin"},
     "J_a_model_based": {"color": ROLES["model_based"], "marker": "s", "label": "model-based, twin"},

@@ -139,11 +139,12 @@ def known_physics(
             f"{', '.join(sensed)}, which is all that sensors read; let believed() of the Config give the plant without "
             "its extensions."
         )
-    for model in filter(None, (plant, believed)):
-        report = check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics)
-    if report.step_error is not None and report.step_error > COARSE:  # of the physics, which is the last one
+    models = [plant] if believed is None else [plant, believed]
+    reports = [check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics) for model in models]
+    step_error = reports[-1].step_error  # of the twin's physics
+    if step_error is not None and step_error > COARSE:
         warnings.warn(
-            f"a Runge-Kutta step of dt={physics.dt:g} s of plant {physics.name!r} errs by {report.step_error:.2%} of "
+            f"a Runge-Kutta step of dt={physics.dt:g} s of plant {physics.name!r} errs by {step_error:.2%} of "
             "its move, which a fit takes for one of the coefficients: use a smaller dt or an advance of several steps.",
             stacklevel=3,
         )

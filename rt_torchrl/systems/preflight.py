@@ -219,7 +219,7 @@ def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring
 def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
     """Windows of so many control intervals of records: ``ROWS`` of each, if it has them, and all of the first ones.
 
-    Each begins in the middle of the one before.
+    None begins before the middle of the one before.
     """
     parts = []
     for record in records:
@@ -249,20 +249,19 @@ def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) ->
     if not mistakes and not explained:
         early = flown.t < (EARLY - 0.5) * plant.dt
         first = flown._replace(**{name: getattr(flown, name)[early] for name in Flown._fields[:6]})
-        noise, likely = (
-            fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1)),
-            list[str](),
-        )
+        noise = fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1))
+        likely: list[str] = []
         # More coefficients than readings would explain anything, and noise leaves nothing that is explained wholly.
         if first.ends.numel() > len(fit.guess) and not noise.any():
-            mistakes, _ = _better(fit, first, wholly=True)
+            mistakes, _ = _better(fit, first, fit.unexplained(first), wholly=True)
         if not mistakes:
-            mistakes, likely = _better(fit, flown)
+            mistakes, likely = _better(fit, flown, present)
         for length in LENGTHS if noise.any() else ():
             if not mistakes and 2 * length <= max(len(record.actions) for record in records):
                 windows = _windows(records, plant, length)
-                mistakes, _ = _better(fit, windows, among=likely)
-                share = fit.unexplained(windows).share
+                left = fit.unexplained(windows)
+                mistakes, _ = _better(fit, windows, left, among=likely)
+                share = left.share
     doubts = [] if mistakes else _doubts(plant, torch.where(noise, 0.0, share), flown)
     return Wiring(plant, moved, present, noise, tuple(mistakes), tuple(doubts))
 
@@ -278,15 +277,11 @@ def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterato
     drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
     for signal, draws, read in zip(plant.states, drawn.T, flown.states[flown.t == 0.0].T, strict=True):
         if len(read) and _outside(draws, read, widths=0.5):
-            fitting = [
-                words
-                for words, scale, offset in _other_scales(signal.unit, FACTORS)
-                if not _outside(draws, offset + scale * read, widths=0.5)
-            ]
+            scales = _other_scales(signal.unit, FACTORS)
+            fits = (f"{words}, " for words, a, b in scales if not _outside(draws, b + a * read, widths=0.5))
             yield (
-                f"state {signal.name} is read at the start {_beside(signal, read, draws)}: "
-                f"{''.join(f'{words}, ' for words in fitting[:1])}a wrong zero, or other starts than those that plans "
-                "are made for"
+                f"state {signal.name} is read at the start {_beside(signal, read, draws)}: {next(fits, '')}a wrong "
+                "zero, or other starts than those that plans are made for"
             )
 
 
@@ -324,15 +319,14 @@ def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:
 
 
 def _better(
-    fit: "_Fit", flown: Flown, *, wholly: bool = False, among: Sequence[str] = ()
+    fit: "_Fit", flown: Flown, present: Unexplained, *, wholly: bool = False, among: Sequence[str] = ()
 ) -> tuple[list[str], list[str]]:
-    """The mistakes, among all or some, that fit much better than the wiring as it is, one of a kind; and likely ones.
+    """The mistakes, among all or some, that leave much less than the wiring at present, one of a kind; and likely ones.
 
     A mistake in the reading of a state must leave at most half of that state, and others hardly more of any state than
     the present wiring. Where no error of the present wiring shows beside the size of its state, or with ``wholly``, a
     mistake must explain all movement.
     """
-    present = fit.unexplained(flown)
     if not (present.share > EXPLAINED).any():
         return [], []
     shows = (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0))).any() and not wholly
@@ -369,18 +363,24 @@ class _Fit:
 
     def unexplained(self, flown: Flown, evaluations: int = EVALUATIONS) -> Unexplained:
         """What is left with the coefficients that fit best after so many evaluations."""
-        weights = self._fitted(flown, evaluations) if self._weights else self.guess
-        error, (size, moves) = self._errors(flown, weights)[0].square().mean(0), self.movement(flown)
+        return self._left(flown, self._least_errors(flown, evaluations))
+
+    def _left(self, flown: Flown, errors: Float[Tensor, "n n_s"]) -> Unexplained:
+        error, (size, moves) = errors.square().mean(0), self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
         return Unexplained(share, error.sqrt())
 
+    def _least_errors(self, flown: Flown, evaluations: int) -> Float[Tensor, "n n_s"]:
+        weights = self._fitted(flown, evaluations) if self._weights else self.guess
+        return self._errors(flown, weights)[0]
+
     def noise(self, flown: Flown) -> Bool[Tensor, " n_s"]:
         """Whether the errors of a state in neighbouring intervals alternate, as those by noise of its sensor do."""
-        errors = self._errors(flown, self._fitted(flown, EVALUATIONS) if self._weights else self.guess)[0]
+        errors = self._least_errors(flown, EVALUATIONS)
         neighbours = (flown.t.diff() - self.plant.dt).abs() < 0.5 * self.plant.dt
         alike = (errors[1:] * errors[:-1])[neighbours].mean(0) / errors.square().mean(0)
         beyond = -ALTERNATING / max(1, int(neighbours.sum())) ** 0.5
-        return (self.unexplained(flown).share > EXPLAINED) & (alike < beyond)
+        return (self._left(flown, errors).share > EXPLAINED) & (alike < beyond)
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
