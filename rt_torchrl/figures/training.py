@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import REAL, ROLES, TWIN, array, caption, legend_above, legend_below, role_name
+from rt_torchrl.figures.style import REAL, ROLES, TWIN, array, caption, legend_below, role_name
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import Role
@@ -134,8 +134,8 @@ def learning_curves(snapshot: Snapshot) -> Figure:
             if np.isfinite(column := _column(episodes, key)).any():
                 ax.plot(np.arange(1, len(episodes) + 1), column, linewidth=1.4, markersize=4, **look)
         style.logarithmic_if_wide(ax)
-        legend_above(ax)
         caption(ax, name)
+    legend_below(figure, axes)
     _draw_timeline(strip, episodes, snapshot.live)
     return figure
 
