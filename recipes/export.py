@@ -15,13 +15,12 @@ from rt_torchrl.atomic_file import make_folder
 from rt_torchrl.options import Text
 
 FORMATS: dict[str, dict[str, Callable[..., float | None]]] = {
-    "policy": {"c": rt.export_c, "onnx": rt.export_onnx, "pt2": rt.export_program},
+    "policy": {"c": rt.export_c, "onnx": rt.export_onnx},
     "controller": {"c": rt.export_controller, "discon": rt.export_discon},
     "twin": {"c": rt.export_twin},
 }
 """What writes each thing in each format."""
 KINDS = tuple(dict.fromkeys(kind for kinds in FORMATS.values() for kind in kinds))
-DEFAULT = ("c", "pt2")
 SIZES = {"policy": "actions' ranges", "controller": "actions' ranges", "twin": "sizes of the states"}
 """What differences are shares of."""
 
@@ -37,8 +36,8 @@ class Config:
             hypothesis that explains the records best); controller and twin are written in C, a turbine's controller as
             a DISCON too.
         role: role of the policy, model_based or model_free.
-        formats: one or more of c (C99 file and header), onnx (with the extra export), pt2 (torch.export) and discon
-            (shared library with the interface of Bladed, and its C file); by default c, and pt2 of a policy.
+        formats: one or more of c (C99 file and header), onnx (with the extra export) and discon (shared library with
+            the interface of Bladed, and its C file).
         output: folder for the files; by default RUN/exported.
         name: name of the files and of the C function, to which _controller, _discon or _twin is added; by default
             PLANT_ROLE, and PLANT for the twin.
@@ -48,30 +47,27 @@ class Config:
     run: Annotated[Path, Positional]
     what: tuple[str, ...] = ("policy",)
     role: str = "model_based"
-    formats: tuple[str, ...] | None = None
+    formats: tuple[str, ...] = ("c",)
     output: Path | None = None
     name: str | None = None
     recipe: Text | None = None
 
     def __post_init__(self):
-        formats = DEFAULT if self.formats is None else self.formats
-        for option, chosen, allowed in (("what", self.what, FORMATS), ("formats", formats, KINDS)):
+        for option, chosen, allowed in (("what", self.what, FORMATS), ("formats", self.formats, KINDS)):
             if not chosen or not set(chosen) <= set(allowed):
                 raise ValueError(f"{option}={chosen} must be some of {', '.join(allowed)}.")
         for what in self.what:
-            if not set(FORMATS[what]) & set(formats):
+            if not set(FORMATS[what]) & set(self.formats):
                 allowed = " or ".join(FORMATS[what])
-                raise ValueError(f"formats={formats} holds no format of the {what}; add {allowed}.")
-        unused = [kind for kind in self.formats or () if not any(kind in FORMATS[what] for what in self.what)]
+                raise ValueError(f"formats={self.formats} holds no format of the {what}; add {allowed}.")
+        unused = [kind for kind in self.formats if not any(kind in FORMATS[what] for what in self.what)]
         if unused:
             raise ValueError(f"no {unused[0]} of {' and '.join(self.what)} can be written; leave it out.")
-        if self.name is not None and not (self.name.isascii() and self.name.isidentifier()):
-            raise ValueError(f"name={self.name!r} must be a name in C; give --output a folder.")
 
 
 def main(config: Config) -> None:
     # ONNX is the last one, because its packages may be missing.
-    formats = sorted(config.formats or DEFAULT, key=lambda kind: kind == "onnx")
+    formats = sorted(config.formats, key=lambda kind: kind == "onnx")
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):

@@ -83,7 +83,7 @@ from .runs.command_line import main_of, shipped_plants
 from .figures.snapshot import Snapshot
 from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export.discon import export_discon
-from .export import export_c, export_controller, export_onnx, export_program, export_twin
+from .export import export_c, export_controller, export_onnx, export_twin
 
 __version__: str
 
@@ -207,7 +207,6 @@ __all__ = [
     "export_discon",
     "export_onnx",
     "export_policy_fmu",
-    "export_program",
     "export_twin",
     "export_twin_fmu",
     "identification_cost",

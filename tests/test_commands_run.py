@@ -116,9 +116,7 @@ def test_a_log_is_recorded_and_identified(clone):
     assert "rotor_speed" in done(identify, clone).stdout
 
 
-@pytest.mark.parametrize(
-    ("formats", "kinds"), [("c onnx pt2", {".c", ".h", ".onnx", ".pt2"}), ("discon", {".c", ".so"})]
-)
+@pytest.mark.parametrize(("formats", "kinds"), [("c onnx", {".c", ".h", ".onnx"}), ("discon", {".c", ".so"})])
 def test_a_policy_is_exported(formats, kinds, clone):
     (command,) = (c for c in commands() if "recipes/export.py" in c and c.endswith(f"--formats {formats}"))
     folder = re.search(r"runs/\S+", command).group()

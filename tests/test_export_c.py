@@ -63,7 +63,7 @@ def test_literals_are_read_back_to_the_bit(number):
 
 
 def test_what_has_no_c_form_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"policy Law cannot be .* aten.sort.* pt2 and onnx"):
+    with pytest.raises(ValueError, match=r"policy Law cannot be .* aten.sort.* ONNX takes more"):
         export_c(Law(lambda law, e: e.sort(-1).values[..., :1]), tmp_path / "policy.c", LinearQuadratic())
     assert not list(tmp_path.iterdir())
 

@@ -48,15 +48,16 @@ def leave_run_of(folder, config, plant):
 
 
 def test_the_recipe_writes_every_format(tmp_path, capsys):
-    pytest.importorskip("onnxruntime"), pytest.importorskip("onnxscript")
+    onnxruntime, _ = map(pytest.importorskip, ("onnxruntime", "onnxscript"))
     _, parts = leave_run(tmp_path, "wind_turbine", policy="bias")
     export = recipe("export")
-    export.main(export.Config(run=tmp_path, role="model_free", formats=("c", "onnx", "pt2")))
+    export.main(export.Config(run=tmp_path, role="model_free", formats=("c", "onnx")))
     written = {path.name for path in (tmp_path / "exported").iterdir()}
-    assert written == {f"wind_turbine_model_free.{suffix}" for suffix in ("c", "h", "onnx", "pt2")}
-    loaded = torch.export.load(tmp_path / "exported" / "wind_turbine_model_free.pt2").module()
+    assert written == {f"wind_turbine_model_free.{suffix}" for suffix in ("c", "h", "onnx")}
+    session = onnxruntime.InferenceSession(tmp_path / "exported" / "wind_turbine_model_free.onnx")
     e = torch.tensor([[0.2, -0.4]], dtype=torch.float64)
-    assert torch.equal(loaded(e), parts["model_free"](e)) and not torch.equal(loaded(e), parts["model_based"](e))
+    action = torch.from_numpy(session.run(["action"], {"observation": e.numpy()})[0])
+    assert torch.allclose(action, parts["model_free"](e)) and not torch.allclose(action, parts["model_based"](e))
     assert "void wind_turbine_model_free(" in (tmp_path / "exported" / "wind_turbine_model_free.h").read_text()
     assert capsys.readouterr().out.count("of the actions' ranges") >= 2
 
@@ -82,12 +83,14 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
     ("options", "message"),
     [
         ({"role": "oracle"}, "role='oracle' does not exist in this run; choose model_based or model_free"),
-        ({"formats": ()}, r"formats=\(\) must be some of c, onnx, pt2"),
+        ({"formats": ()}, r"formats=\(\) must be some of c, onnx, discon"),
         ({"what": ("plant",)}, r"what=\('plant',\) must be some of policy, controller, twin"),
-        ({"what": ("policy", "twin"), "formats": ("pt2",)}, r"formats=\('pt2',\) holds no format of the twin; add c\."),
-        ({"what": ("policy", "controller"), "formats": ("pt2",)}, r"no format of the controller; add c or discon\."),
-        ({"what": ("controller",), "formats": ("c", "pt2")}, "no pt2 of controller can be written; leave it out"),
-        ({"name": "../up"}, "name='../up' must be a name in C"),
+        (
+            {"what": ("policy", "twin"), "formats": ("onnx",)},
+            r"formats=\('onnx',\) holds no format of the twin; add c\.",
+        ),
+        ({"what": ("policy", "controller"), "formats": ("onnx",)}, r"no format of the controller; add c or discon\."),
+        ({"what": ("controller",), "formats": ("c", "onnx")}, "no onnx of controller can be written; leave it out"),
         ({"recipe": Path("nowhere.py")}, "nowhere.py does not exist"),
         ({"recipe": RECIPES / "record_log.py"}, "Config of recipe=.* is no class derived from RunConfig"),
         ({"recipe": RECIPES / "flapping_wing.py"}, "cannot be carried out.*no option.*engineering"),
@@ -107,7 +110,9 @@ def test_without_the_packages_of_onnx_all_else_is_written(tmp_path, monkeypatch)
     leave_run(tmp_path, "wind_turbine", policy="bias")
     export = recipe("export")
     config = export.Config(run=tmp_path, what=("policy", "twin"), formats=("onnx", "c"), name="blade")
-    with pytest.raises(ValueError, match="ONNX needs the package onnx.*--extra export"):
+    with pytest.raises(
+        ValueError, match="onnxscript is not installed: install the extra, pip install 'rt_torchrl.export.'"
+    ):
         export.main(config)
     written = {path.name for path in (tmp_path / "exported").iterdir()}
     assert written == {"blade.c", "blade.h", "blade_twin.c", "blade_twin.h"}

@@ -107,8 +107,8 @@ def test_a_run_of_an_own_script_is_loaded_without_naming_it_and_exported(tmp_pat
     run, export = load_run(str(tmp_path / "run")), recipe("export")
     assert run.plant.name == "room" and run.plant.horizon == run.config.horizon == 2.0
     for given in (None, str(tmp_path / "train.py")):
-        export.main(export.Config(run=tmp_path / "run", recipe=given, formats=("pt2",), output=tmp_path))
-        (tmp_path / "room_model_based.pt2").unlink()
+        export.main(export.Config(run=tmp_path / "run", recipe=given, output=tmp_path))
+        (tmp_path / "room_model_based.c").unlink()
 
 
 class Own(RunConfig):

@@ -25,7 +25,7 @@ COMPILERS = ("cc", "gcc", "clang")
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
 TOLERANCE = 1e-9
 """Greatest difference of a number in C from that in torch, as a share of the range or size of its signal."""
-REMEDY = "Write it with arithmetic of torch in float64; the formats pt2 and onnx take more of a policy than C does."
+REMEDY = "Write it with arithmetic of torch in float64; ONNX takes more of a policy than C does."
 
 
 class TracedFunction(NamedTuple):

@@ -1,7 +1,5 @@
-"""A policy as a PyTorch program, which torch alone can load, or as an ONNX model for other run-time systems."""
+"""A policy as an ONNX model, for other run-time systems."""
 
-import importlib.util
-import io
 import json
 import logging
 import math
@@ -12,44 +10,16 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.export import Dim, ExportedProgram
+from torch.export import Dim
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached, require_policy, sample_observations
+from rt_torchrl.loading import of_extra
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 INTERFACE = "interface.json"
-"""Name of the extra file of a program, and of the metadata of a model, that describes observations and actions."""
-ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-
-
-def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
-    """Write a policy as a program of torch.export, (batch, n_o) -> (batch, n_a) in double precision.
-
-    A program runs without this library. Its extra file ``interface.json`` describes observations and actions. Who loads
-    it must trust where it comes from, because ``torch.export.load`` runs the code of objects that are pickled in it::
-
-        policy = torch.export.load("policy.pt2").module()
-        action = policy(observation)
-
-    Args:
-        policy: any ``policy(observation) -> action`` in double precision.
-        path: file to write, such as ``policy.pt2``.
-        plant: plant with the policy's observations and actions.
-
-    Returns:
-        Greatest difference from the policy, as a share of the range of an action.
-
-    Raises:
-        ValueError: if the policy does not fit the plant or cannot be traced, or the program does not agree with it.
-    """
-    policy, file = detached(policy, plant), io.BytesIO()
-    torch.export.save(_traced(policy, plant), file, extra_files={INTERFACE: json.dumps(interface(plant), indent=2)})
-    loaded = torch.export.load(io.BytesIO(file.getvalue())).module()
-    difference = require_policy(policy, loaded, plant, "the exported program")
-    write_atomically(Path(path), file.getvalue())
-    return difference
+"""Name of the metadata of a model that describes observations and actions."""
 
 
 def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
@@ -70,19 +40,14 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         ValueError: if a package of the extra ``export`` is missing, the policy does not fit the plant or has no ONNX
             form, onnxruntime cannot run the model, or the model does not agree with the policy.
     """
-    for package in ONNX_PACKAGES:
-        if importlib.util.find_spec(package) is None:
-            raise ValueError(
-                f"ONNX needs the package {package}: install the extra, uv run --extra export or pip install "
-                "'rt_torchrl[export]'; or take the .pt2 program or C."
-            )
-    import onnxruntime
-
+    onnxruntime = [of_extra(package, "export") for package in ("onnx", "onnxscript", "onnxruntime")][-1]
     policy = detached(policy, plant)
-    program = _traced(policy, plant)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of a missing torchvision
     options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
     try:
+        program = torch.export.export(
+            policy, (sample_observations(plant.observations, 3),), dynamic_shapes=({0: Dim("batch")},)
+        ).run_decompositions({})  # which takes no operator apart, but removes those that do nothing, such as dropout
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)
             exported = torch.onnx.export(
@@ -94,10 +59,11 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
         content = model.SerializeToString()
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    except Exception as error:  # exporter and onnxruntime raise several kinds
+    except Exception as error:  # torch.export, its exporter and onnxruntime raise many kinds, of several modules
         raise ValueError(
             f"policy {type(policy).__name__} has no ONNX form that onnxruntime runs in double precision: "
-            f"{str(error).strip()}. Use the .pt2 program or C instead."
+            f"{str(error).strip()}. Write branches on values as torch.where, and sizes so that any batch can be "
+            "passed, or use C."
         ) from error
 
     def run(rows: Tensor) -> Tensor:
@@ -106,25 +72,6 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     difference = require_policy(policy, run, plant, "the ONNX model")
     write_atomically(Path(path), content)
     return difference
-
-
-def _traced(policy: nn.Module, plant: Plant) -> ExportedProgram:
-    """The graph of a policy for any number of observations, ``(batch, n_o) -> (batch, n_a)``.
-
-    Raises:
-        ValueError: if torch.export cannot trace the policy.
-    """
-    name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
-    try:
-        program = torch.export.export(policy, (observations,), dynamic_shapes=({0: Dim("batch")},))
-        # This takes no operator apart, but removes those that do nothing in evaluation, such as dropout.
-        program = program.run_decompositions({})
-    except Exception as error:  # torch.export raises many kinds, of several modules
-        raise ValueError(
-            f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
-            "torch.where, and sizes such that any batch can be passed."
-        ) from error
-    return program
 
 
 def interface(plant: Plant) -> dict[str, Any]:
