@@ -11,8 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 import torch
 from torch import Tensor, nn

@@ -5,8 +5,7 @@ from typing import Any
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 import torch
 

@@ -5,8 +5,7 @@ from typing import Any, Literal
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing

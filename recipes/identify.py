@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 import torch
 import tyro

@@ -10,8 +10,7 @@ from typing import Literal
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 import torch
 from tensordict import TensorDictBase

@@ -6,8 +6,7 @@ from typing import Any
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import rt_torchrl as rt
 
-if __name__ == "__main__":
-    rt.begin_loading()
+rt.begin_loading(__name__)
 
 import numpy as np
 import torch
