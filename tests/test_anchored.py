@@ -316,16 +316,6 @@ def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
     assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == 1.0
 
 
-def test_the_best_that_flew_is_found_whatever_was_computed_before():
-    gains, episodes = [(2.0, 0.5), (0.5, 0.5), (1.0, 0.5)], virtual_episodes(LinearQuadratic())
-    fresh, warm, like = belief_of(gains), belief_of(gains), LinearGain([[0.0, 0.0]])
-    warm.anchors()
-    (weights, judged), (same, again) = fresh.best_flown(like, episodes), warm.best_flown(like, episodes)
-    assert judged == again and torch.equal(weights["gain"], same["gain"])
-    policy = LinearGain(weights["gain"].tolist())
-    assert warm.judge(policy, episodes).expected == pytest.approx(judged.expected, rel=1e-12)
-
-
 def test_a_belief_that_corrects_nothing_withdraws_what_another_one_said():
     belief, policy, episodes = belief_of([(0.5, 0.5)]), LinearGain([[0.5, 0.5]]), virtual_episodes(LinearQuadratic())
     twin = belief.virtual.twin

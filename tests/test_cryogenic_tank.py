@@ -262,18 +262,6 @@ def test_the_tables_are_those_that_coolprop_makes():
     np.testing.assert_allclose(np.loadtxt(DATA / "Hydrogen.csv", delimiter=","), table_of("Hydrogen"), rtol=1e-9)
 
 
-def test_derivatives_of_values_and_slopes():
-    fit = Saturation()
-    sizes = torch.stack(fit(double(HIGH)), -1).abs()
-
-    def scaled(log_p):
-        values, slopes = fit.with_slopes(log_p.exp())
-        return torch.stack(values, -1) / sizes, torch.stack(slopes, -1) / sizes * HIGH
-
-    log_p = torch.linspace(math.log(LOW) + 0.01, math.log(HIGH) - 0.01, 7, dtype=torch.float64)
-    assert torch.autograd.gradcheck(scaled, log_p.requires_grad_())
-
-
 # Outside the range
 
 

@@ -1,14 +1,12 @@
 """Estimation from partial and noisy readings: against regression and backpropagation."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
-from seeds_and_numbers import drawn, seeded
 from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, room_records
 from test_uncertainty import position
 
@@ -47,15 +45,6 @@ def test_derivatives_are_those_of_backpropagation():
     # The same derivatives, forward instead of backward.
     assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
-
-
-def test_sensitivities_are_computed_in_machine_code():
-    """Of an interval that was never seen before, with a batched Jacobian inside, which is a pure function."""
-    plant = LinearQuadratic(dt=0.0123, horizon=0.123)
-    twin = DigitalTwin(plant, plant.make_closure(seeded()))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="engine 'autograd' takes the place")
-        twin.sensitivities(*drawn(plant), torch.zeros(1, 10, 1, dtype=torch.float64))
 
 
 def test_a_line_with_holes_is_fitted_as_by_regression():

@@ -105,13 +105,6 @@ def test_an_error_of_a_whole_turn_is_none(oscillator):
     assert [ax.get_title(loc="right") for ax in figures.states(turned).axes] == ["RMS 0 m", "RMS 0 m/s"]
 
 
-def test_observations_of_a_part_have_the_times_of_the_episode(oscillator):
-    plant = copy.deepcopy(oscillator.plant)
-    plant.observe = lambda t, state, exogenous: t.unsqueeze(-1)
-    part = replace(oscillator, plant=plant, record=oscillator.record._replace(start=1.0))
-    assert visited_observations(part)[0].item() == 1.0
-
-
 def test_exogenous_shows_record_mean_and_samples(turbine):
     above, below = figures.exogenous(turbine).axes
     assert same(line(above, "recorded"), turbine.record.exogenous[:, 0])

@@ -84,16 +84,6 @@ def flown(plant, duration):
 # Forces
 
 
-def test_a_heavier_body_is_moved_by_the_same_forces(plant):
-    state, action, wind = double(0.0, 0.0, 0.3, -0.2), double(77.0, -5.0), double(1.0)
-    heavier = FlappingWing(mass=1.25 * MASS)
-    one, other = (
-        p.vector_field(double(0.01).squeeze(), state, action, wind, plant.closure)[2:] for p in (plant, heavier)
-    )
-    gravity = double(0.0, -GRAVITY)
-    torch.testing.assert_close(1.25 * (other - gravity), one - gravity)
-
-
 @pytest.mark.parametrize("model, tolerance", [(Converged, 1e-6), (FlappingWing, 2e-3)])
 def test_forces_are_those_of_the_matrices_and_the_arc_cosine(model, tolerance):
     # Relative to the weight or the force, whichever is larger. Converged: the trapezium rule at the tip, a square root,

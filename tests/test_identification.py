@@ -122,56 +122,6 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
     assert estimation(None).run(calm).segment == 0
 
 
-class Pole(PositiveCoefficients):
-    names = {"weight": "1/s^2", "friction": "1/s", "gear": "1/s^2"}
-    true_coefficients = (15.0, 0.5, 10.0)
-
-
-class Upright(Plant):
-    """A pole that a command holds upright."""
-
-    name = "upright"
-    states = (Signal(symbol="a", name="angle", unit="rad"), Signal(symbol="u", name="rate", unit="rad/s"))
-    actions = (Signal(symbol="c", name="command", unit="-", low=-5.0, high=5.0),)
-    inputs = ()
-    observations = states
-
-    def __init__(self):
-        super().__init__(dt=0.04, horizon=8.0, closure=Pole.true())
-
-    def vector_field(self, t, state, action, exogenous, closure):
-        angle, rate = state.unbind(-1)
-        weight, friction, gear = closure(state).unbind(-1)
-        return torch.stack([rate, weight * torch.sin(angle) - friction * rate + gear * action[..., 0]], -1)
-
-    def draw_initial_state(self, batch, generator):
-        return 0.2 * torch.randn(batch, 2, generator=generator, dtype=torch.float64)
-
-    observe = running_cost = draw_exogenous = make_closure = None
-
-
-def test_whole_records_that_bent_weights_explain_are_not_taken_for_those_of_an_unstable_system():
-    """With friction of 65 /s for 0.5 whole records leave a quarter of the readings, and segments only their noise."""
-    plant, generator = Upright(), torch.Generator().manual_seed(2)
-    noise = torch.tensor([0.001, 0.005], dtype=torch.float64)
-    state, nothing = plant.draw_initial_state(10, generator), torch.zeros(10, 200, 0).double()
-    read = lambda: state + noise * torch.randn(10, 2, generator=generator, dtype=torch.float64)  # noqa: E731
-    readings, commands = [read()], []
-    for _ in range(200):
-        dither = 0.06 * torch.randn(10, 1, generator=generator, dtype=torch.float64)
-        commands.append(readings[-1] @ torch.tensor([[-3.0], [-0.7]]).double() + dither)
-        with torch.no_grad():
-            state = plant.step(torch.tensor(0.0), state, commands[-1], nothing[:, 0], plant.closure).state
-        readings.append(read())
-    sensors = sensors_of(plant, ["angle", "rate"])
-    records = sensor_records(plant, sensors, Trajectory(torch.stack(readings, 1), torch.stack(commands, 1), nothing))
-    estimate = Estimation(DigitalTwin(plant, Pole(torch.tensor([10.0, 0.2, 6.0]))), sensors).run(records)
-    assert 0 < estimate.segment < 200 and list(estimate.noise.values()) == pytest.approx(noise.tolist(), rel=0.1)
-    for name, error in estimate.uncertainty.standard_errors().items():
-        true = dict(zip(Pole.names, Pole.true_coefficients, strict=True))[name]
-        assert abs(estimate.after[name] - true) < 3.0 * error < 0.6 * max(true, 1.0)
-
-
 @pytest.mark.parametrize(("angle", "unstable"), [(0.0, True), (np.pi, False)])
 def test_instability_is_sought_where_the_record_is_and_not_where_a_replay_comes_to_rest(angle, unstable):
     """Held upright with noise; replays with much friction fall, and hang like those of a record that hangs."""

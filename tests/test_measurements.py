@@ -1,6 +1,5 @@
 """What a policy observes: any choice of a plant's measurements, each scaled to order one; and previews of the wind."""
 
-import json
 import math
 
 import pytest
@@ -162,26 +161,6 @@ def test_policies_of_some_sensors_see_nothing_else(name):
             moved = state.clone()
             moved[:, k] += 0.01
             assert torch.equal(plant.observe(time, moved, exogenous), seen), signal.name
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("name", "episodes", "words", "most"),
-    [
-        # Without noise the fit goes on until steps end in rounding.
-        ("flapping_wing", 1, ("--twinning.assimilation.iterations", "60"), 1e-3),
-        ("cryogenic_tank", 2, (), 1e-2),
-    ],
-)
-def test_the_weights_are_those_of_the_real_system_after_two_and_three_episodes(tmp_path, name, episodes, words, most):
-    """The classical controller flies the first of them; the twin has the true form, and sensors have no noise."""
-    fitted = ["--twinning.assimilation.inputs", "record", "--twinning.assimilation.method", "levenberg_marquardt"]
-    fitted += ["--twinning.arm", "model_based", "--twinning.hypotheses.which", "none", *words]
-    short = ["--episodes", str(episodes), "--unseen", "2", "--no-figures", "--threads", "1"]
-    recipe = load_recipe(RECIPES / f"{name}.py")
-    recipe.main(from_command_line(recipe.Config, [*short, *fitted, "--log-dir", str(tmp_path)]))
-    laws = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]
-    assert max(abs(laws["found"][weight] / true - 1.0) for weight, true in laws["true"].items()) < most
 
 
 # What a newcomer writes for a plant of their own, and what exploration adds to its policy.

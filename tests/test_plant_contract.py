@@ -90,6 +90,8 @@ def test_fulfils_the_contract(kind, plant):
 def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     plant = shortened(kind, GREATEST_EPISODE)
     episode, policy = fly(plant)
+    assert episode["next", "truncated"].flatten().tolist() == [False] * (plant.n_steps - 1) + [True]
+    assert not episode["next", "terminated"].any()
     twin = DigitalTwin(plant, plant.closure)
     exogenous, states = episode["exogenous"], torch.cat([episode["state"], episode["next", "state"][:, -1:]], 1)
     scale = states.abs().amax((0, 1))
@@ -105,15 +107,6 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
             torch.testing.assert_close(flown.actions, episode["next", "applied"], rtol=1e-12, atol=1e-12)
         cost = control_cost(plant, flights["policy"])
     torch.testing.assert_close(cost, -episode["next", "reward"][..., 0].mean(-1), rtol=1e-12, atol=0)
-
-
-def test_episode_is_truncated_at_the_horizon_and_never_terminated(plant):
-    episode, _ = fly(plant)
-    assert episode.shape == (1, plant.n_steps)
-    last = torch.zeros(1, plant.n_steps, 1, dtype=torch.bool)
-    last[:, -1] = True
-    assert torch.equal(episode["next", "truncated"], last) and torch.equal(episode["next", "done"], last)
-    assert not episode["next", "terminated"].any()
 
 
 # Every plant, policy, closure and extension that is shipped becomes machine code: nothing in it is refused.

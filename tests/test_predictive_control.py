@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 from seeds_and_numbers import drawn, seeded
 
 from rt_torchrl import Decaying, DivergenceError, PlantEnv, Rollout, StateFeedback, control_cost
-from rt_torchrl.control.command_cost import PENALTY, CommandCost, descend
+from rt_torchrl.control.command_cost import PENALTY, CommandCost
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -300,18 +300,3 @@ def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
         wanted = by_rollout(plant, plan, state, exogenous, hold=hold, start=start)
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
-
-
-def test_a_descent_goes_round_points_where_the_cost_is_not_finite():
-    def evaluate(point):
-        x = float(point[0])
-        with np.errstate(invalid="ignore"):
-            return float((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x)), np.array(
-                [2.0 * (x - 0.7) + 0.005 / np.sqrt(0.8 - x)]
-            )
-
-    found = descend(evaluate, np.array([0.1]), iterations=1000, tolerance=1e-10)
-    x = np.linspace(0.0, 0.8, 80_001)
-    np.testing.assert_allclose(found.point, x[np.argmin((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x))], atol=1e-4)
-    with pytest.raises(FloatingPointError, match="at the start"):
-        descend(evaluate, np.array([0.9]), iterations=1000, tolerance=1e-10)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 
 import pytest
 import torch
@@ -281,13 +280,6 @@ def test_a_start_far_from_what_the_plant_draws_is_a_warning():
     with pytest.warns(UserWarning, match="state angle_2 is read at the start between 1.5.* draws 0.00.* a wrong zero"):
         check.require()
     rt.check_real_system(wired(ARM), ARM).require()
-
-
-def test_a_warning_of_a_far_start_names_a_unit_with_which_it_fits():
-    """Without torque the equations of the arm are linear, and hold in any unit."""
-    check = rt.check_real_system(wired(ARM, scale=TURN), ARM, spread=0.0)
-    assert not check.mistakes and len(check.doubts) == 4
-    assert all(re.search(r"draws [^:]*: in deg(/s)?, where the plant has rad", doubt) for doubt in check.doubts)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import time
 from unittest.mock import Mock
 
 import pytest
@@ -87,15 +86,6 @@ def test_it_names_each_step_as_it_begins():
     told = []
     twinning().episode(told.append)
     assert told == STEPS and set(dashboard.WORDS) == {"start", "fit", "imitation", *STEPS}
-
-
-def test_a_log_names_a_step_that_lasts(monkeypatch, capsys):
-    monkeypatch.setattr(dashboard, "QUIET", 0.2)
-    with Progress(1) as bar:
-        for step in ("interact", "learn", "plan"):
-            bar.doing(step)
-        time.sleep(0.6)
-    assert capsys.readouterr().err.splitlines() == ["real episode", "planning"]
 
 
 def test_the_table_says_why_a_policy_is_live_and_what_the_other_half_gave():

@@ -10,12 +10,10 @@ from linear_quadratic import LinearQuadratic
 from small_runs import FULL, SMALL, believing, small_run, stepped_cost
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict.nn import TensorDictModule
-from test_early_ends import Falling
 from test_hypotheses import LAG, Suspecting
 from torchrl.collectors import Collector
 
 import rt_torchrl as rt
-from rt_torchrl import figures as drawings
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
@@ -52,26 +50,6 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     mean = summary["unseen"][f"J_a_{summary['live']}"]["mean"]
     # Two libraries sum the costs, in an order that depends on the machine.
     assert metrics["episodes"][3]["J_a_unseen"] == pytest.approx(mean, rel=1e-14)
-
-
-def test_the_figure_of_the_flights_ends_with_them(tmp_path, monkeypatch):
-    """Nothing moves after an early end, whatever a policy asks for."""
-    shown, draw, plant = {}, drawings.flights, Falling()
-
-    def kept(physics, flown, **options):
-        shown.update(flown)
-        return draw(physics, flown, **options)
-
-    def idle(episodes):
-        for policy in run.algorithm.policies.values():
-            policy.gain.data.zero_()
-
-    monkeypatch.setattr(drawings, "flights", kept)
-    run = small_run(tmp_path, 1, plant, figures=True, parts={"callbacks": [idle]})
-    run.train()
-    (flown,) = shown.values()
-    *going_on, ended = plant.ended(flown.states).tolist()
-    assert len(flown.actions) < plant.n_steps and ended and not any(going_on)
 
 
 def test_a_twin_may_believe_in_another_plant(tmp_path):

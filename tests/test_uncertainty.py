@@ -1,12 +1,11 @@
 """Standard errors, simulations and counted intervals, against closed forms and Monte Carlo."""
 
-import functools
 import math
 
 import numpy as np
 import pytest
 import torch
-from interval_coverage import CASES, LOGS, coverage, logged, recorded
+from interval_coverage import CASES, coverage
 from seeds_and_numbers import double
 from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
@@ -150,26 +149,6 @@ def test_a_simulation_starts_where_its_first_samples_say():
 @pytest.mark.parametrize("name", ["flapping_wing", "cryogenic_tank", "cascaded_tanks", "pendulum", "wind_turbine"])
 def test_intervals_hold_the_truth_on_each_plant(name):
     """200 simulations with 1 % of noise of the sensors' scatter."""
-    case = CASES[name]
-    plant, generator = case.plant(), torch.Generator().manual_seed(0)
-    simulated, config = (plant, case.closure(plant), sensors_of(plant, case.sensors)), EstimationConfig(iterations=20)
-    make = functools.partial(recorded, *simulated, generator, flights=case.flights)
-    found = coverage(*simulated, make, simulations=200, config=config)
-    assert 0.90 <= found.mean <= 0.98
-    assert (found.error_over_bound[~found.error_over_bound.isnan()] < 1.5).all()
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("errors", ["fisher", "robust"])
-@pytest.mark.parametrize("name", LOGS)
-def test_intervals_from_logs_hold_the_truth(name, errors):
-    """100 logs that are coarser than dt, lack rows or samples, or hold some states alone."""
-    of, sensors, logging = LOGS[name]
-    plant, generator = CASES[of].plant(), torch.Generator().manual_seed(0)
-    simulated = plant, CASES[of].closure(plant), sensors_of(plant, sensors)
-    config = EstimationConfig(iterations=20, errors=errors)
-    found = coverage(*simulated, lambda: logged(*simulated, generator, logging), simulations=100, config=config)
-    # Values of one log go together: three standard errors of a share of 100 logs.
-    for level, inside in ((0.95, found.inside), (0.68, found.inside_68)):
-        shares = inside[~inside.isnan()]
-        assert (shares - level).abs().max() < 3.0 * np.sqrt(level * (1.0 - level) / 100) + 0.01, (level, shares)
+    inside, error_over_bound = coverage(CASES[name], simulations=200)
+    assert 0.90 <= inside <= 0.98
+    assert (error_over_bound[~error_over_bound.isnan()] < 1.5).all()

@@ -1,7 +1,6 @@
 """States that no sensor reads and a twin does not know, and policies that observe past observations."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -188,25 +187,6 @@ def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(
             for p, x in ((plain, flown), (plant, found))
         ]
         torch.testing.assert_close(*costs, rtol=1e-13, atol=1e-13)
-
-
-@pytest.mark.parametrize("kind", [*rt.shipped_plants().values(), partial(WindTurbine, observe=("measured",))])
-def test_the_plants_and_all_that_they_suspect(kind):
-    base = kind()
-    plant = rt.StackedObservations(base, 2)
-    suspects = {**plant.suspects(), **plant.further_suspects()}
-    assert suspects.keys() == {**base.suspects(), **base.further_suspects()}.keys()
-    n_o, readings = len(base.observations), len(plant.states)
-    for each in (plant, *suspects.values()):
-        assert each.readings == plant.states and each.observations == plant.observations
-        start, exogenous, commands = flight(each, 4)
-        with torch.no_grad():
-            states = Rollout(each, each.closure, engine="autograd")(start, exogenous, commands).states
-        found = observed(each, states, exogenous)
-        torch.testing.assert_close(found, by_hand(found[..., :n_o], 2), rtol=0.0, atol=0.0)
-        # A twin begins a replay with what was read.
-        again = each.at_rest(states[:, 0, :readings])
-        assert torch.equal(again[:, :readings], states[:, 0, :readings])
 
 
 class Mass(LinearQuadratic):
