@@ -1,4 +1,4 @@
-"""Generators with a seed, episodes of a plant, tensors in double precision, and a clock, which many tests need."""
+"""Generators with a seed, episodes of a plant and their steps, tensors in double precision, and a clock."""
 
 import torch
 
@@ -17,6 +17,19 @@ def drawn(plant, count=1, seed=0):
     """Initial states and inputs of episodes of a plant."""
     generator = seeded(seed)
     return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+
+
+@torch.no_grad()
+def stepped(plant, closure, state, exogenous, act):
+    """States, applied actions and J_a of episodes by the plant's own step in a loop, under ``act(k, t, state, z)``."""
+    states, applied, cost = [state], [], 0.0
+    for k, z in enumerate(exogenous.unbind(-2)):
+        t, s = torch.tensor(k * plant.dt, dtype=torch.float64), states[-1]
+        end, action = plant.step(t, s, act(k, t, s, z), z, closure)
+        cost = cost + plant.running_cost(t, s, action, z) / exogenous.shape[-2]
+        states.append(end)
+        applied.append(action)
+    return torch.stack(states, -2), torch.stack(applied, -2), cost
 
 
 class Time:

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import stepped
 
 from rt_torchrl import ExplorationConfig, HypothesesConfig, LearnerConfig, RefereeConfig, Run, RunConfig, TwinningConfig
 
@@ -22,16 +22,10 @@ SMALL = dataclasses.replace(FULL, learner=IDLE)
 """Options of small runs: all steps, and all but the model-free policy's iterations."""
 
 
-@torch.no_grad()
 def stepped_cost(episodes, policy):
-    """Mean J_a of a policy without the library's rollout: the plant's step in a loop."""
-    plant, s, total = episodes.plant, episodes.initial_state, 0.0
-    for k in range(plant.n_steps):
-        t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
-        a = plant.actuate(s, policy(s))
-        total = total + plant.running_cost(t, s, a, z) / plant.n_steps
-        s = plant.step(t, s, a, z, episodes.closure).state
-    return total.mean().item()
+    """Mean J_a of a policy without the library's rollout."""
+    flown = episodes.plant, episodes.closure, episodes.initial_state, episodes.exogenous
+    return stepped(*flown, lambda k, t, s, z: policy(s))[2].mean().item()
 
 
 def believing(physics):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearQuadratic
-from seeds_and_numbers import drawn
+from seeds_and_numbers import drawn, stepped
 from small_runs import SMALL, small_run
 from test_export_recipe import recipe
 from test_hypotheses import Suspecting, ensemble
@@ -44,16 +44,6 @@ def run(tmp_path_factory):
     return load_run(folder, Config)
 
 
-def stepped(plant, closure, state, exogenous, act):
-    """States of a plant that is stepped by hand."""
-    states = [state]
-    with torch.no_grad():
-        for k, z in enumerate(exogenous):
-            t = torch.tensor(k * plant.dt, dtype=torch.float64)
-            states.append(plant.step(t, states[-1], act(k, t, states[-1], z), z, closure).state)
-    return torch.stack(states)
-
-
 def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
     believed, policy = run.twin.believed, run.policy(run.live)
     assert run.twin.hypothesis == "lags" and believed.plant.states != run.physics.states
@@ -61,7 +51,7 @@ def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
     flown = run.simulate(policy, z, start, on="twin")
     rest = believed.plant.at_rest(start)
     act = lambda k, t, s, w: policy(believed.plant.observe(t, s, w))  # noqa: E731
-    expected = stepped(believed.plant, believed.closure, rest, z, act)
+    expected, *_ = stepped(believed.plant, believed.closure, rest, z, act)
     torch.testing.assert_close(flown.states, expected, rtol=1e-9, atol=1e-9)
     assert torch.equal(run.simulate(policy, z, expected[0], on="twin").states, flown.states)
     batch = start.expand(1, 2), z[None]
@@ -84,7 +74,7 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
     misfits = {}
     for name, twin in (("lags", believed), (ALONE, DigitalTwin(run.physics, run.closure))):
         start = twin.plant.at_rest(flown.states[0, :2])
-        states = stepped(twin.plant, twin.closure, start, flown.exogenous, lambda k, t, s, w: flown.actions[k])
+        states, *_ = stepped(twin.plant, twin.closure, start, flown.exogenous, lambda k, t, s, w: flown.actions[k])
         misfits[name] = twin.plant.dt * run.physics.discrepancy(states[1:, :2], flown.states[1:, :2]).sum().item()
     assert misfits["lags"] < 0.1 * misfits[ALONE] and unseen_J_p < 0.1 * misfits[ALONE]
     # So has its RMS error, which is told in units.

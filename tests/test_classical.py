@@ -3,7 +3,7 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from seeds_and_numbers import drawn
+from seeds_and_numbers import drawn, stepped
 
 from rt_torchrl import ClassicalController, DivergenceError, SaturatedAffine
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
@@ -39,12 +39,10 @@ def test_a_flight_is_the_plants_steps_under_the_saturated_command():
     state, exogenous = episodes(plant, size=3.0)
     flown = PD(plant, (2.0, 1.0)).fly(state, exogenous)
     assert flown.states.shape == (6, 31, 2) and flown.actions.shape == (6, 30, 1)
-    for k in range(plant.n_steps):
-        command = (-2.0 * state[:, :1] - 1.0 * state[:, 1:]).clamp(-2.0, 2.0)
-        t = torch.tensor(k * plant.dt, dtype=torch.float64)
-        state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
-        torch.testing.assert_close(flown.states[:, k + 1], state, rtol=1e-13, atol=1e-13)
-        torch.testing.assert_close(flown.actions[:, k], applied, rtol=1e-13, atol=1e-13)
+    law = lambda k, t, s, z: (-2.0 * s[:, :1] - 1.0 * s[:, 1:]).clamp(-2.0, 2.0)  # noqa: E731
+    states, applied, _ = stepped(plant, plant.closure, state, exogenous, law)
+    torch.testing.assert_close(flown.states, states, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(flown.actions, applied, rtol=1e-13, atol=1e-13)
     assert (flown.actions.abs() == 2.0).any()
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from seeds_and_numbers import seeded
+from seeds_and_numbers import seeded, stepped
 
 from rt_torchrl import Rollout, SaturatedAffine, Signal, export_controller, export_twin, shipped_plants
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -38,18 +38,6 @@ class InC:
         return list(self.action)
 
 
-def flown(plant, state, exogenous, act, closure=None):
-    """The states and commands of an episode of the plant under ``act(k, state)``."""
-    states, commands = [state], []
-    with torch.no_grad():
-        for k, z in enumerate(exogenous.unbind(1)):
-            commands.append(act(k, state))
-            t = torch.tensor([k * plant.dt], dtype=torch.float64)
-            state = plant.step(t, state, commands[-1], z, closure or plant.closure).state
-            states.append(state)
-    return torch.cat(states), torch.cat(commands)
-
-
 def law(plant):
     """A policy that holds the turbine near its reference, so that speed and wind move all filters."""
     policy = SaturatedAffine(len(plant.observations), plant.actions, generator=seeded(3))
@@ -75,22 +63,22 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     in_c.start(start[0, 0].item(), exogenous[0, 0, 0].item())
     in_c.state.memory[:] = start[0, 1:].tolist()
 
-    def by_c(k, state):
-        return torch.tensor([in_c.step(state[0, 0].item(), exogenous[0, k, 0].item())], dtype=torch.float64)
+    def by_c(k, t, state, z):
+        return torch.tensor([in_c.step(state[0, 0].item(), z.item())], dtype=torch.float64)
 
     controller, held = Controller(plant, policy), {}
 
-    def by_torch(k, state):
-        t, speed, memory = torch.tensor([k * plant.dt], dtype=torch.float64), state[:, :1], start[:, 1:]
+    def by_torch(k, t, state, z):
+        t, speed, memory = t[None], state[:, :1], start[:, 1:]
         if k:
             memory = controller.advance(t - plant.dt, *held["before"], speed)
-        command, _ = controller.act(t, memory, speed, exogenous[:, k])
-        held["before"] = (memory, speed, exogenous[:, k], command)
+        command, _ = controller.act(t, memory, speed, z)
+        held["before"] = (memory, speed, z, command)
         return command
 
-    states, actions = flown(plant, start, exogenous, by_c)
+    (states,), (actions,), _ = stepped(plant, plant.closure, start, exogenous, by_c)
     assert len(actions) == 300 and actions.std(0).min() > 0.0
-    expected, _ = flown(plant, start, exogenous, by_torch)
+    expected = stepped(plant, plant.closure, start, exogenous, by_torch)[0][0]
     size = expected.abs().amax(0)
     assert ((states - expected).abs() / size).max() < CLOSE
     # The memory of the actuators is that of the plant; the filters differ by the curvature of the speed in an interval.
@@ -224,7 +212,7 @@ def test_twins_of_the_plants(name, kind, tmp_path):
     assert export_twin(closure, tmp_path / "twin.c", plant, name="twin") < CLOSE
     state, exogenous = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())[:, :50]
     middle = torch.tensor([[0.5 * (a.low + a.high) for a in plant.actions]], dtype=torch.float64)
-    expected, _ = flown(plant, state, exogenous, lambda k, s: middle, closure)
+    (expected,), *_ = stepped(plant, closure, state, exogenous, lambda *_: middle)
     found, step = c_array(state[0].tolist()), library(tmp_path / "twin.c").twin_step
     for k, z in enumerate(exogenous[0].tolist()):  # the next state is written where the state was read
         step(ctypes.c_double(k * plant.dt), found, c_array(middle[0].tolist()), c_array(z), found)

@@ -10,7 +10,7 @@ import typing
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
-from seeds_and_numbers import drawn
+from seeds_and_numbers import drawn, stepped
 from small_runs import SMALL, small_run
 from test_documentation import leave_finished_run
 from test_early_ends import Falling
@@ -210,13 +210,9 @@ def test_an_episode_is_that_of_the_plant_stepped_by_hand(run):
     policy = run.policy("model_based")
     for system, plant, closure in (("real", run.plant, run.plant.closure), ("twin", run.physics, run.closure)):
         flown = run.simulate(policy, wind, on=system, seed=3)
-        state = flown.states[0]
-        with torch.no_grad():
-            for k in range(40):
-                t = torch.tensor(k * plant.dt, dtype=torch.float64)
-                step = plant.step(t, state, policy(plant.observe(t, state, wind[k])), wind[k], closure)
-                torch.testing.assert_close(flown.states[k + 1], step.state, rtol=1e-9, atol=1e-9)
-                state = step.state
+        act = lambda k, t, s, z, plant=plant: policy(plant.observe(t, s, z))  # noqa: E731
+        states, *_ = stepped(plant, closure, flown.states[0], wind, act)
+        torch.testing.assert_close(flown.states, states, rtol=1e-9, atol=1e-9)
 
 
 def test_what_is_left_out_is_drawn_and_the_same_seed_is_the_same_episode(run):

@@ -10,6 +10,7 @@ import torch
 from faulty_system import as_reported
 from figure_reading import draw
 from linear_quadratic import LinearGain, LinearQuadratic
+from seeds_and_numbers import stepped
 from small_runs import FULL, IDLE
 from test_algorithm import flown, twinning
 from test_classical import PD
@@ -60,13 +61,8 @@ def run_on(machine, folder, *, closure=None, baselines=None, first=None, callbac
 
 def costs_by_hand(plant, closure, episodes, act):
     """J_a of episodes that are flown in a loop of our own."""
-    s, costs = plant.at_rest(episodes.initial_state), 0.0
-    for k in range(STEPS):
-        t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
-        command = act(t, s, z)
-        costs = costs + plant.running_cost(t, s, plant.actuate(s, command), z) / STEPS
-        s = plant.step(t, s, command, z, closure).state
-    return costs + plant.terminal_cost(s) / (STEPS * plant.dt)
+    states, _, costs = stepped(plant, closure, plant.at_rest(episodes.initial_state), episodes.exogenous, act)
+    return costs + plant.terminal_cost(states[:, -1]) / (STEPS * plant.dt)
 
 
 def machine():
@@ -89,7 +85,7 @@ def test_a_training_flies_its_episodes_and_nothing_else_and_is_judged_on_the_twi
     assert unseen["J_p"]["mean"] is None and unseen["J_p_before"]["mean"] is None
     # The same flights in a loop of our own, under the law that the twin has found.
     twin, policy, plant = run.algorithm.twin, run.algorithm.policies["model_based"], rig.inner.plant
-    costs = costs_by_hand(plant, twin.closure, run.unseen, lambda t, s, z: policy(plant.observe(t, s, z)))
+    costs = costs_by_hand(plant, twin.closure, run.unseen, lambda k, t, s, z: policy(plant.observe(t, s, z)))
     assert unseen["costs"]["model_based"] == pytest.approx(costs.tolist(), rel=1e-9)
     # What nobody knows is not simulated as if it were the guess of the data sheet.
     finished = load_run(tmp_path, plant=plant)
@@ -198,7 +194,7 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     law = Tracking(plant)
     memory = [law.first_memory(run.unseen.initial_state)]
 
-    def act(t, s, z):
+    def act(k, t, s, z):
         command, memory[0] = law.respond(s, memory[0], z)
         return command
 

@@ -9,7 +9,7 @@ import torch
 from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import blocks
-from seeds_and_numbers import drawn, seeded
+from seeds_and_numbers import drawn, seeded, stepped
 from small_runs import SMALL
 from test_classical import PD
 from test_export_controller import InC
@@ -94,11 +94,9 @@ def test_state_feedback_acts_on_readings(kind):
     flown = controller.fly(state, exogenous, plant=plant)
     assert flown.states.shape == (2, 21, 5)
     controller.begin()
-    s = state
-    for k in range(plant.n_steps):
-        command = controller.act(k * plant.dt, s[:, :2], exogenous[:, k])
-        s = plant.step(torch.tensor(k * plant.dt).double(), s, command, exogenous[:, k], plant.closure).state
-    torch.testing.assert_close(flown.states[:, -1], s, rtol=1e-5, atol=1e-5)
+    act = lambda k, t, s, z: controller.act(k * plant.dt, s[:, :2], z)  # noqa: E731
+    states, *_ = stepped(plant, plant.closure, state, exogenous, act)
+    torch.testing.assert_close(flown.states, states, rtol=1e-5, atol=1e-5)
 
 
 def test_a_safety_layer_sees_readings_alone(tmp_path):

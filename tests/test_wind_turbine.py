@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import brentq
-from seeds_and_numbers import double, seeded
+from seeds_and_numbers import double, seeded, stepped
 
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine import plant as module
@@ -321,15 +321,13 @@ def flown(plant, command, seed=0):
 def test_our_plant_goes_where_rosco_goes(rosco, observe, monkeypatch):
     """Two codes, one turbine: they part by the error of ROSCO's Euler steps, which is of first order."""
     plant = WindTurbine(horizon=HORIZON, inertia=float(nrel5mw().J), observe=(observe,))
-    t, errors = torch.zeros(1, dtype=torch.float64), []
+    errors = []
     for step in (0.1, 0.05):
         monkeypatch.setattr(adapter, "STEP", step)
         real = flown(plant, [35e3, 4.0])
-        state = real["state"][:1]
-        for k in range(plant.n_steps):
-            command, wind = real["action"][k : k + 1], real["exogenous"][k : k + 1]
-            state = plant.step(t, state, command, wind, plant.closure).state
-        errors.append(state[0] - real["next", "state"][-1])
+        commanded = lambda k, *_, real=real: real["action"][k]  # noqa: E731
+        states, *_ = stepped(plant, plant.closure, real["state"][0], real["exogenous"], commanded)
+        errors.append(states[-1] - real["next", "state"][-1])
     moved = (real["next", "state"][-1] - real["state"][0]).abs()
     coarse, fine = errors
     assert moved[0] > 0.2 and abs(fine[0]) < 1e-3
