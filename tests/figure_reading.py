@@ -1,7 +1,5 @@
 """Common parts of the tests of figures: a snapshot without a training, and readings of a drawn figure."""
 
-from itertools import combinations
-
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
@@ -37,31 +35,6 @@ def draw(figure) -> set[str]:
     """Draw a figure, which raises on broken mathtext, and return every text in it."""
     FigureCanvasAgg(figure).draw()
     return {text.get_text() for text in figure.findobj(Text)}
-
-
-def clipped_texts(figure) -> list[str]:
-    """Titles and axis labels that stick out of the canvas of a drawn figure."""
-    texts = [figure._suptitle]
-    for ax in figure.axes:
-        texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
-    boxes = [(text.get_text(), text.get_window_extent()) for text in texts if text.get_text()]
-    width, height = figure.bbox.size
-    return [name for name, b in boxes if b.x0 < 0 or b.y0 < 0 or b.x1 > width or b.y1 > height]
-
-
-def collisions(figure) -> list[tuple[str, str]]:
-    """Pairs of titles, ticks along x and legends of a drawn figure that lie on each other."""
-    boxes = []
-    for ax in figure.axes:
-        first, last = sorted(ax.get_xlim())
-        # A tick beyond the ends has a label too, which is not drawn.
-        ticks = [text for text in ax.get_xticklabels() if first <= text.get_position()[0] <= last]
-        texts = [ax._left_title, ax._right_title, *ticks]
-        boxes += [
-            (text.get_text(), text.get_window_extent()) for text in texts if text.get_text() and text.get_visible()
-        ]
-        boxes += [("legend", ax.get_legend().get_window_extent())] if ax.get_legend() else []
-    return [(one, other) for (one, first), (other, second) in combinations(boxes, 2) if first.overlaps(second)]
 
 
 def line(ax, label):

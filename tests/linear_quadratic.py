@@ -36,6 +36,17 @@ class LinearGain(nn.Module):
         return -(observation.unsqueeze(-2) * self.gain).sum(-1)
 
 
+class Constant(nn.Module):
+    """A policy that always commands the same."""
+
+    def __init__(self, *values):
+        super().__init__()
+        self.values = nn.Parameter(torch.tensor(values, dtype=torch.float64))
+
+    def forward(self, observation):
+        return self.values.expand(*observation.shape[:-1], -1)
+
+
 class LinearQuadratic(Plant):
     """A damped oscillator with one force; see the module's docstring."""
 

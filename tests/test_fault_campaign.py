@@ -20,7 +20,7 @@ import pytest
 import torch
 from fault_victim import EPISODES, QUICK, SHIPPED, victim
 from small_runs import small_run
-from test_run_folder import same
+from test_run_folder import Bomb, same
 
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import load_tensors, plain, save_tensors
@@ -120,16 +120,6 @@ def test_sigterm_ends_a_training_with_its_results(tmp_path, monkeypatch):
     monkeypatch.setattr(run.algorithm, "episode", terminated)
     assert len(run.train()["episodes"]) == 2 and (tmp_path / "weights.pt").exists()
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-
-
-class Bomb:
-    """A pickle that would make a file."""
-
-    def __init__(self, file):
-        self.file = file
-
-    def __reduce__(self):
-        return Path.touch, (self.file,)
 
 
 def broken(whole, number, trace):

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import struct
 import warnings
 import zipfile
 from functools import cache, partial
@@ -15,6 +14,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic
+from test_disturbances import HH_HEADER, bts_bytes, hh_line, plane
 
 from rt_torchrl import RunConfig
 from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
@@ -47,21 +47,7 @@ def read_sensor_log(path):
     assert sum(len(s.actions) for s in resampled.segments) <= INTERVALS_PER_ROW * len(found.times)
 
 
-def write_wind_text(path):
-    rest = f"{0.0:8.2f}{0.1:8.2f}{0:8.3f}{0.2:8.3f}{0:8.3f}{0:8.2f}"
-    rows = [f"{0.5 * k:8.3f}{8.0 + 0.1 * k:8.2f}{rest}" for k in range(20)]
-    path.write_text("! wind\n" + "\n".join(rows) + "\n")
-
-
-def write_wind_field(path):
-    u = 8.0 + np.sin(np.arange(20 * 3 * 3)).reshape(20, 3, 3)
-    slope = 65535.0 / (u.max() - u.min())
-    offset = -32768.0 - slope * u.min()
-    header = struct.pack("<h4i6f", 7, 3, 3, 0, 20, 10.0, 8.0, 0.05, 8.0, 85.0, 75.0)
-    header += struct.pack("<6f", slope, offset, 3.0, 1.0, 5.0, -2.0) + struct.pack("<i", 4) + b"text"
-    raw = np.zeros((20, 9, 3), dtype="<i2")
-    raw[..., 0] = np.clip(np.rint(slope * u + offset), -32768, 32767).reshape(20, 9)
-    path.write_bytes(header + raw.tobytes())
+WIND = HH_HEADER + "".join(hh_line(0.5 * k, 8.0 + 0.1 * k) for k in range(20))
 
 
 def read_wind_file(path):
@@ -109,8 +95,11 @@ def read_config(path):
 READERS = {
     "log.csv": (write_log, read_sensor_log),
     "log.parquet": (write_log, read_sensor_log),
-    "wind.hh": (write_wind_text, read_wind_file),
-    "wind.bts": (write_wind_field, read_wind_file),
+    "wind.hh": (
+        lambda path: path.write_text(WIND),
+        read_wind_file,
+    ),
+    "wind.bts": (lambda path: path.write_bytes(bts_bytes(plane()[1])[0]), read_wind_file),
     "table.csv": (partial(shutil.copy, DATA / "nrel5mw_Cp_table_rosco.csv"), read_table),
     "weights.pt": (lambda path: save_tensors(path, weights()), read_weights),
     "checkpoint-0001.pt": (lambda path: save_tensors(path, content()), read_checkpoint),

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import Constant, LinearQuadratic
 from seeds_and_numbers import double, seeded
 from test_export_recipe import RECIPES
 
@@ -210,22 +210,11 @@ def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unc
 # Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.
 
 
-class Held(torch.nn.Module):
-    """A policy that always asks for the same action."""
-
-    def __init__(self, action):
-        super().__init__()
-        self.action = action
-
-    def forward(self, observation):
-        return self.action
-
-
 @pytest.mark.parametrize("intervals", [0.0, 3.0])
 def test_deviation_and_correlation_are_those_asked_for(intervals):
-    plant, middle = LinearQuadratic(), torch.zeros(100, 1, dtype=torch.float64)  # of the range of ±2 N
+    plant = LinearQuadratic()
     config = ExplorationConfig(spread=0.1, correlation_time=intervals * plant.dt)
-    actor = LivePolicy(plant, Held(middle), config, generator=seeded())
+    actor = LivePolicy(plant, Constant(0.0), config, generator=seeded())  # the middle of ±2 N
     actor.begin(actor.policy, strength=0.5)
     found = torch.stack([actor(torch.zeros(100, 2, dtype=torch.float64)) for _ in range(400)]) / 2.0
     rho = math.exp(-1.0 / intervals) if intervals else 0.0

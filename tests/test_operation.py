@@ -11,7 +11,7 @@ import pytest
 import test_algorithm
 import torch
 from faulty_system import FaultySystem, Injection, as_reported
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import Constant, LinearQuadratic
 from small_runs import small_run
 from test_classical import PD
 from test_faults import require_true
@@ -79,17 +79,6 @@ def test_learning_in_no_time_is_the_synchronous_run_to_the_bit():
         one, other = ahead.episode(), plain.episode()
         assert one["real_cost"] == other["real_cost"] and one["live"] == other["live"] and one["windows"] == 1.0
     assert torch.equal(weights(ahead), weights(plain))
-
-
-class Constant(torch.nn.Module):
-    """A policy that always commands the same."""
-
-    def __init__(self, *values):
-        super().__init__()
-        self.values = torch.nn.Parameter(torch.tensor(values, dtype=torch.float64))
-
-    def forward(self, observation):
-        return self.values.expand(*observation.shape[:-1], -1)
 
 
 def handed_over(plant, before, after, at, env=None):

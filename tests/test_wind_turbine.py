@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from linear_quadratic import Constant
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded, stepped
@@ -303,13 +304,6 @@ def rosco():
     return pytest.importorskip("rosco")
 
 
-class Held(torch.nn.Module):
-    """A policy with one command for every observation."""
-
-    def forward(self, observation):
-        return observation.new_tensor([35e3, 2.0]).expand(*observation.shape[:-1], 2)
-
-
 def flown(plant, command, seed=0):
     """An episode of ROSCO's simulator under a constant command."""
     system = rosco_turbine(plant, seed=seed)
@@ -360,6 +354,6 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     speed = plant.gear_ratio * found.states[..., 0]
     assert 100.0 < speed.mean() < 125.0 and speed.max() < 1.2 * plant.rated_generator_speed
     # The same winds as a policy gets.
-    other = unseen.fly(Held())
+    other = unseen.fly(Constant(35e3, 2.0))
     assert torch.equal(other.exogenous, found.exogenous)
     assert torch.equal(other.states[:, 0, 0], found.states[:, 0, 0])
