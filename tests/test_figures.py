@@ -75,7 +75,7 @@ def same(line, values) -> bool:
 def test_every_figure_is_drawn(name, request):
     snapshot = request.getfixturevalue(name)
     drawn = figures.figures_of(snapshot)
-    assert set(drawn) == EVERYWHERE | {"exogenous"}
+    assert set(drawn) == EVERYWHERE | {"exogenous", "learned_law"}
     for figure in drawn.values():
         assert draw(figure)
     # Nothing is left behind: no figure is registered anywhere.
@@ -184,7 +184,7 @@ def test_learning_curves_and_timeline(oscillator):
 def test_arms_leave_out_what_they_do_not_have(arm):
     snapshot = trained(LinearQuadratic(horizon=2.0), arm=arm, episodes=1)
     drawn = figures.figures_of(snapshot)
-    assert set(drawn) == EVERYWHERE | ({"exogenous"} if arm == "model_based" else set())
+    assert set(drawn) == EVERYWHERE | ({"exogenous", "learned_law"} if arm == "model_based" else set())
     assert len(drawn["learning_curves"].axes) == (2 if arm == "model_free" else 3)
     for figure in drawn.values():
         draw(figure)
@@ -342,6 +342,20 @@ def test_heat_exchanger_of_each_closure(tank):
     mean = tank.record.exogenous.mean().item()
     assert line(held, "mean load of the last episode").get_ydata()[0] == mean
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+
+
+def test_the_law_is_drawn_with_its_errors_where_records_went(turbine):
+    figure, visited = figures.learned_law(turbine), turbine.features
+    for feature, ax in enumerate(figure.axes):
+        x = torch.from_numpy(line(ax, "twin").get_xdata())
+        assert (x[0], x[-1]) == (visited[:, feature].min(), visited[:, feature].max())
+        points = visited.median(0).values.repeat(len(x), 1)
+        points[:, feature] = x
+        values = turbine.closure(points).squeeze(-1)
+        assert same(line(ax, "twin"), values) and line(ax, "true") and line(ax, "initial twin")
+        (band,) = ax.collections
+        ends = values + 1.96 * turbine.uncertainty.errors_of(lambda p=points: turbine.closure(p).squeeze(-1))
+        np.testing.assert_allclose(np.nanmax(band.get_paths()[0].vertices[:, 1]), ends.max().item(), rtol=1e-12)
 
 
 def test_closure_weights_with_truth_start_and_units(tank):

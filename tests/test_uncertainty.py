@@ -50,6 +50,14 @@ def test_errors_and_correlations_are_those_of_regression():
     assert (high - low) / 2.0 == pytest.approx(1.959964 * math.sqrt(C[0, 0]))
 
 
+def test_errors_of_a_law_are_those_of_regression():
+    """w_0 + w_1 z where it was seen and beyond."""
+    estimate, z = line_estimate(), torch.tensor([[-2.0], [1.0], [7.0]], dtype=torch.float64)
+    found = estimate.uncertainty.errors_of(lambda: estimate.likelihood.twin.closure(z)).squeeze(-1)
+    X = np.concatenate([np.ones((3, 1)), z], 1)
+    np.testing.assert_allclose(found.numpy(), np.sqrt(np.diag(X @ exact_covariance() @ X.T)), rtol=1e-6)
+
+
 class InUnits(Slope):
     """The line's law with weights and values in other units."""
 

@@ -1,12 +1,14 @@
 """The snapshot of a training after an episode, which figures are drawn from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.fit.law import asked_features
+from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -34,6 +36,8 @@ class Snapshot:
         episodes: entries of the episodes, as in ``metrics.json``.
         simulated: words of a title for a record that is no episode of the training; empty for one that is.
         on_the_twin: whether the twin has flown the record.
+        features: features for which the twin asked its closure in the latest records, or in the one of a flight.
+        uncertainty: what the closure's weights are worth by the last fit; None if that is not known.
     """
 
     plant: Plant
@@ -50,6 +54,8 @@ class Snapshot:
     episodes: list[dict[str, Any]]
     simulated: str = ""
     on_the_twin: bool = False
+    features: Float[Tensor, "rows f"] = field(default_factory=lambda: torch.empty(0, 0))
+    uncertainty: Uncertainty | None = None
 
     @classmethod
     @torch.no_grad()
@@ -58,6 +64,7 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
+        latest = list(algorithm.short_term) if algorithm.config.arm != "model_free" else []
         process = algorithm.virtual.paired([record])[1][0] if algorithm.virtual.processes else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
@@ -73,4 +80,6 @@ class Snapshot:
             large_scale=None if process is None else process.mean,
             realisations=None if process is None else process.sample(5, generator),
             episodes=episodes,
+            features=asked_features(twin, latest),
+            uncertainty=algorithm.assimilation.uncertainty(latest),
         )

@@ -16,6 +16,7 @@ from torch import Tensor
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, ROLES, TWIN, array, caption, legend_below, role_name
+from rt_torchrl.fit.law import varying
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import Role
@@ -37,6 +38,10 @@ IDENTIFICATION: dict[str, dict[str, Any]] = {
 
 RESOLUTION = 81
 """Number of points along each observation."""
+SURE = 1.96
+"""Standard errors in half of a 95 % interval."""
+MOST_OUTPUTS, MOST_FEATURES = 4, 3
+"""Greatest numbers of outputs and of features of a law that are shown."""
 SHOWN = 400
 """Greatest number of visited observations that are shown; more would hide the contours."""
 DOTS: dict[str, Any] = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
@@ -46,12 +51,14 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     """The figures of a training by name; a figure with nothing to show is left out.
 
     ``exogenous`` needs an arm that trains a twin, and a plant with inputs. ``closure_weights`` needs an arm that trains
-    a twin, and episodes that report coefficients by name. ``learning_curves`` needs a reported episode.
+    a twin, and episodes that report coefficients by name. ``learned_law`` needs one, and a closure whose outputs depend
+    on its features. ``learning_curves`` needs a reported episode.
     """
     twin = snapshot.large_scale is not None
     chosen = [states, policy_contours]
     chosen += [exogenous] if twin and snapshot.plant.inputs else []
     chosen += [closure_weights] if twin and tracked_weights(snapshot.episodes) else []
+    chosen += [learned_law] if twin and law_panels(snapshot) else []
     chosen += [learning_curves] if snapshot.episodes else []
     return {figure.__name__: figure(snapshot) for figure in chosen}
 
@@ -152,6 +159,7 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     columns = tracked_weights(snapshot.episodes)
     laws = snapshot.true_closure, snapshot.initial_closure
     true, start = ({} if law is None else _numbers(named_weights(law)) for law in laws)
+    errors = {} if snapshot.uncertainty is None else snapshot.uncertainty.standard_errors()
     described = described_weights(snapshot.initial_closure)
     wide = min(3, len(columns))
     size = (0.6 + 3.6 * wide, 1.3 + 2.8 * -(-len(columns) // wide))
@@ -159,6 +167,9 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     figure, axes = style.grid(len(columns), wide, title=title, size=size, xlabel="episode")
     for ax, (name, values) in zip(axes, columns.items(), strict=True):
         ax.plot(np.arange(1, len(values) + 1), values, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
+        if 0.0 < errors.get(name, 0.0) < math.inf:
+            ends: dict[str, Any] = {"capsize": 3, "label": "95 % interval"}
+            ax.errorbar(len(values), values[-1], SURE * errors[name], color=TWIN, linewidth=1.0, **ends)
         if name in start:
             ax.axhline(start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
@@ -172,6 +183,54 @@ def closure_weights(snapshot: Snapshot) -> Figure:
     axes[0].set_xlim(0.5, len(snapshot.episodes) + 0.5)
     legend_below(figure, axes)
     return figure
+
+
+@torch.no_grad()
+def learned_law(snapshot: Snapshot) -> Figure:
+    """The outputs of the closure that depend on its features, over each of these; the others have their median.
+
+    Curves span the features of the latest records, some of which are marked below: a twin can only know what was
+    visited. The band is the 95 % interval that the noise of the last fit leaves.
+    """
+    places = law_panels(snapshot)
+    rows, columns = (len({place[axis] for place in places}) for axis in (0, 1))
+    title, size = "Learned law, where the last records went", (max(5.5, 0.8 + 3.8 * columns), 1.3 + 2.6 * rows)
+    figure, grid = style.panels(rows, columns, title=title, size=size)
+    for place, ax in zip(places, grid.flat, strict=True):
+        _draw_law(ax, snapshot, *place)
+    legend_below(figure, grid.flat[:1].tolist())
+    return figure
+
+
+def _draw_law(ax: Axes, snapshot: Snapshot, output: int, feature: int) -> None:
+    """Draw an output of the true closure, of the twin's with its 95 % interval, and of the initial twin's."""
+    visited = snapshot.features
+    low, high = visited[:, feature].min().item(), visited[:, feature].max().item()
+    axis = torch.linspace(low, high, RESOLUTION, dtype=visited.dtype, device=visited.device)
+    points = visited.median(0).values.expand(RESOLUTION, -1).clone()
+    points[:, feature] = axis
+    for name, law in style.closures(snapshot).items():
+        if name != "true" or snapshot.true_closure is not None:
+            ax.plot(array(axis), array(law(points)[:, output]), **style.closure_look(name))
+    if snapshot.uncertainty is not None:
+        values = snapshot.closure(points)[:, output]
+        reach = SURE * snapshot.uncertainty.errors_of(lambda: snapshot.closure(points)[:, output])
+        reach[reach.isinf()] = math.nan
+        below, above = array(values - reach), array(values + reach)
+        ax.fill_between(array(axis), below, above, color=TWIN, alpha=0.2, linewidth=0, label="95 % interval")
+    _draw_visited(ax, visited[:, feature])
+    caption(ax, f"output {output + 1} of the closure")
+    ax.set_xlabel(f"feature {feature + 1}")
+
+
+@torch.no_grad()
+def law_panels(snapshot: Snapshot) -> list[tuple[int, int]]:
+    """Places of the output and the feature of each panel of :func:`learned_law`, of the first ones that vary."""
+    visited = snapshot.features
+    if not len(visited):
+        return []
+    outputs, features = varying(snapshot.closure(_some(visited))), varying(visited)
+    return [(output, feature) for output in outputs[:MOST_OUTPUTS] for feature in features[:MOST_FEATURES]]
 
 
 def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:
@@ -242,12 +301,10 @@ def _curves(snapshot: Snapshot) -> Figure:
         values = array(snapshot.policies[role](axis[:, None]))
         for k, ax in enumerate(axes):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
-    visited = array(_some(observations[:, 0]))
     for ax, action in zip(axes, plant.actions, strict=True):
         style.limits(ax, action)
         ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-        rug: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
-        ax.plot(visited, np.full_like(visited, 0.02), "|", label="visited", **rug)
+        _draw_visited(ax, observations[:, 0])
         caption(ax, action.label)
     axes[0].set_xlim(axis[0].item(), axis[-1].item())
     legend_below(figure, axes)
@@ -315,6 +372,13 @@ def contours(
         pair[0].set_ylabel(signals[plane[1]].label)
     axes = [ax for pair in planes.values() for ax in pair]
     axes[0].figure.colorbar(filled, ax=axes, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
+
+
+def _draw_visited(ax: Axes, visited: Float[Tensor, " n"]) -> None:
+    """Draw a mark at the foot of a panel for each visited value that is shown."""
+    marks = array(_some(visited))
+    rug: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
+    ax.plot(marks, np.full_like(marks, 0.02), "|", label="visited", **rug)
 
 
 def _some(visited: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (
 """
 
 import math
+from collections.abc import Callable, Sequence
 from statistics import NormalDist
 from typing import Literal, NamedTuple
 
@@ -76,12 +77,27 @@ class Uncertainty:
             root, squares = root @ vectors, sum(float(block.values.square().sum()) for block in blocks)
             white = squares / max(int(likelihood.samples.sum()) - root.shape[1], 1)
             self.covariance = (root * ratios.clamp_min(white)) @ root.T
-        closure = likelihood.twin.closure
-        self.names, slopes = named_slopes(closure)
-        self._ahead, n = slopes @ ahead, likelihood.weight_count
+        self._ahead, n = ahead, likelihood.weight_count
+        named = self._named()
+        self.names, slopes = list(named), self._slopes(list(named.values()))
         self.named_covariance = slopes @ self.covariance[:n, :n] @ slopes.T
         self._undetermined = self._inverse.unknown(pad(slopes, (0, len(self.covariance) - n)))
-        self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
+        self.values = torch.stack(list(named.values())).detach() if named else torch.empty(0)
+
+    @torch.enable_grad()
+    def _named(self) -> dict[str, Tensor]:
+        return named_values(self.likelihood.twin.closure)
+
+    def _slopes(self, values: Sequence[Tensor]) -> Float[Tensor, "values n_w"]:
+        """Derivatives of numbers by the trained weights of the closure."""
+        weights = [w for w in self.likelihood.twin.closure.parameters() if w.requires_grad]
+        rows = [torch.zeros(0, sum(w.numel() for w in weights), dtype=torch.float64)]
+        for value in values:
+            slopes = tuple(torch.zeros_like(w) for w in weights)
+            if value.requires_grad:  # one that is fixed does not
+                slopes = torch.autograd.grad(value, weights, retain_graph=True, materialize_grads=True)
+            rows.append(torch.cat([slope.flatten() for slope in slopes])[None])
+        return torch.cat(rows)
 
     def unknown(self) -> list[str]:
         """Names of the values that take part in a direction of which the data say nothing."""
@@ -89,8 +105,25 @@ class Uncertainty:
 
     def standard_errors(self) -> dict[str, float]:
         """Standard error of every named value; infinite for one of which the data say nothing, zero for a fixed one."""
-        errors = (self.named_covariance.diagonal().clamp_min(0.0) + self._ahead.square()).sqrt().tolist()
-        return dict(zip(self.names, errors, strict=True)) | dict.fromkeys(self.unknown(), math.inf)
+        errors = self.errors_of(lambda: torch.stack(list(self._named().values()))) if self.names else self.values
+        return dict(zip(self.names, errors.tolist(), strict=True))
+
+    @torch.enable_grad()
+    def errors_of(self, law: Callable[[], Float[Tensor, "*batch"]]) -> Float[Tensor, "*batch"]:
+        """Standard errors of values that the closure's weights give, to first order, such as those of a law.
+
+        One of which the data say nothing is infinite, a fixed one zero.
+
+        Args:
+            law: function that computes the values by the estimated closure, ``lambda: twin.closure(features)``.
+        """
+        values = law()
+        slopes = self._slopes(list(values.flatten()))
+        n = slopes.shape[1]
+        variance = ((slopes @ self.covariance[:n, :n]) * slopes).sum(-1).clamp_min(0.0)
+        errors = (variance + (slopes @ self._ahead).square()).sqrt()
+        errors[self._inverse.unknown(pad(slopes, (0, len(self.covariance) - n)))] = math.inf
+        return errors.view(values.shape)
 
     def correlations(self) -> Float[Tensor, "n_named n_named"]:
         """Correlations of the named values; nan for one of which the data say nothing."""
@@ -197,20 +230,6 @@ def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
         product = scores[:-lag].T @ scores[lag:]
         M = M + (1.0 - lag / (lags + 1.0)) * (product + product.T)
     return M
-
-
-def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named n_w"]]:
-    """Names of the closure's values, and their derivatives by its trained weights."""
-    weights, rows = [w for w in closure.parameters() if w.requires_grad], []
-    with torch.enable_grad():
-        named = named_values(closure)
-        for value in named.values():
-            slopes = tuple(torch.zeros_like(w) for w in weights)
-            if value.requires_grad:  # one that is fixed does not
-                slopes = torch.autograd.grad(value, weights, retain_graph=True, materialize_grads=True)
-            rows.append(torch.cat([slope.flatten() for slope in slopes]))
-    count = sum(w.numel() for w in weights)
-    return list(named), torch.stack(rows) if rows else torch.empty(0, count, dtype=torch.float64)
 
 
 def named_values(closure: nn.Module) -> dict[str, Tensor]:

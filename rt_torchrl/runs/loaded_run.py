@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.fit.law import asked_features
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
@@ -211,6 +212,7 @@ class LoadedRun:
             episodes=self.metrics["episodes"],
             simulated="flight on the twin" if on_the_twin else "one flight",
             on_the_twin=on_the_twin,
+            features=asked_features(self.twin, [read]),
         )
 
 

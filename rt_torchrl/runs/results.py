@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
+from rt_torchrl.fit.law import asked_features, varying
 from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
@@ -143,7 +144,6 @@ def summarise(
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
         "twin": fit_of(algorithm),
-        "network": any(isinstance(part, nn.Linear) for part in closure.modules()),
         "hypotheses": hypotheses_of(algorithm.twin),
         "believed": algorithm.twin.hypothesis,
     }
@@ -154,8 +154,8 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
 
     ``rms`` holds RMS errors by ``STATE [UNIT]``, over segments of ``segment`` control intervals, or whole records with
     0; ``noise`` the noise of the sensors; ``standard_errors`` those of the closure's coefficients, ``correlations`` of
-    these beyond 0.9, the greatest ones first, ``note`` what the standard errors do not hold, in words, and ``covered``
-    the least and the greatest value of each action, input and state in the records, by ``NAME [UNIT]``.
+    these beyond 0.9, the greatest ones first, ``note`` what the standard errors do not hold, in words, and ``law`` what
+    outputs of the closure that depend on its features are worth, see :func:`law_of`.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
     if not records or algorithm.config.arm == "model_free":
@@ -166,26 +166,48 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
             "standard_errors": {},
             "correlations": {},
             "note": "",
-            "covered": {},
+            "law": {},
         }
     plant = algorithm.twin.plant
     levels = zip(plant.readings, algorithm.twin.noise.tolist(), strict=True)
     sensors = [(signal, level) for signal, level in levels if level and signal.name not in plant.controller_states]
     latest, _ = algorithm.virtual.paired(records)
     uncertainty = assimilation.uncertainty(latest)
+    named = uncertainty if hasattr(algorithm.twin.believed.closure, "named_coefficients") else None
     return {
         "rms": assimilation.rms_errors(latest),
         "segment": assimilation.length,
         "noise": {f"{signal.name} [{signal.unit}]": level for signal, level in sensors},
-        "standard_errors": {} if uncertainty is None else uncertainty.standard_errors(),
-        "correlations": {} if uncertainty is None else high_correlations(uncertainty),
+        "standard_errors": {} if named is None else named.standard_errors(),
+        "correlations": {} if named is None else high_correlations(named),
         "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
-        "covered": {
-            f"{signal.name} [{signal.unit}]": [course.min().item(), course.max().item()]
-            for signals, name in ((plant.actions, "actions"), (plant.inputs, "exogenous"), (plant.readings, "states"))
-            for signal, course in zip(signals, torch.cat([getattr(record, name) for record in latest]).T, strict=True)
-        },
+        "law": {} if uncertainty is None else law_of(algorithm.twin, latest, uncertainty),
     }
+
+
+def law_of(twin: DigitalTwin, records: Sequence[Trajectory], uncertainty: Uncertainty) -> dict[str, Any]:
+    """The range of each of the ``features`` in the records, and of each output that depends on them, by its number.
+
+    An output has its ``range`` and the ``median`` and the ``greatest`` of its standard errors there. It is empty if no
+    output depends on the features.
+    """
+    features = asked_features(twin, records)
+    visited = features[:: max(1, len(features) // LAW_ROWS)]
+    values = twin.believed_law(visited) if len(visited) else visited
+    places = varying(values)
+    if not places:
+        return {}
+    errors = uncertainty.errors_of(lambda: twin.believed_law(visited)[:, places])
+    outputs = {
+        str(k + 1): {"range": _ends(values[:, k]), "median": error.median().item(), "greatest": error.max().item()}
+        for k, error in zip(places, errors.T, strict=True)
+    }
+    return {"features": [_ends(course) for course in features.T], "outputs": outputs}
+
+
+def _ends(values: Tensor) -> list[float]:
+    """The least and the greatest value."""
+    return [values.min().item(), values.max().item()]
 
 
 def high_correlations(uncertainty: Uncertainty) -> dict[str, float]:
@@ -269,6 +291,8 @@ MOST_WEIGHTS = 12
 """Greatest number of weights of the closure that the table shows."""
 HIGH_CORRELATION, MOST_CORRELATIONS = 0.9, 3
 """Correlation of the errors of two coefficients that the results name, and greatest number that the table shows."""
+LAW_ROWS = 100
+"""Number of visited features at which the law of the closure is judged."""
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
@@ -342,10 +366,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += alarm_lines(episodes)
     lines += fit_lines(fitted)
     lines += closure_lines(summary["closure"], fitted["standard_errors"])
-    if summary["network"] and fitted["covered"]:
-        ranges = [f"{label}: {low:.3g} to {high:.3g}" for label, (low, high) in fitted["covered"].items()]
-        where = ", ".join(ranges[:MOST_WEIGHTS])
-        lines.append(f"  what a network of the twin has learned holds where its last records went: {where}")
+    lines += law_lines(fitted["law"])
     if high := [f"{pair} {value:.3f}" for pair, value in fitted["correlations"].items()][:MOST_CORRELATIONS]:
         lines.append(f"  correlation of errors: {', '.join(high)}")
     lines += [f"  {note}" for note in [fitted["note"]] if note]
@@ -448,6 +469,23 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None]) -> l
         lines.append(f"  {label:<22}{row}   {description['meaning']}".rstrip())
     if any(error is None or math.isinf(error) for name, error in errors.items() if name in weights):
         lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
+    return lines
+
+
+def law_lines(law: dict[str, Any]) -> list[str]:
+    """Lines with the law of the closure where its last records went; elsewhere it says nothing."""
+    if not law:
+        return []
+    ranges = [f"feature {k} from {low:.3g} to {high:.3g}" for k, (low, high) in enumerate(law["features"], 1)]
+    lines = [f"  law of the closure where its last records went, {', '.join(ranges)}:"]
+    for name, output in list(law["outputs"].items())[:MOST_WEIGHTS]:
+        (low, high), median, greatest = (
+            output["range"],
+            *(_number(output[key], ".2g") for key in ("median", "greatest")),
+        )
+        lines.append(
+            f"    output {name} from {low:.4g} to {high:.4g}, standard error {median} (median), at most {greatest}"
+        )
     return lines
 
 

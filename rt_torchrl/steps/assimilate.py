@@ -284,11 +284,11 @@ class Assimilation:
         return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
 
     def uncertainty(self, records: Sequence[Trajectory]) -> Uncertainty | None:
-        """Robust standard errors of the closure's named coefficients; None where the twin diverges or names nothing.
+        """Robust standard errors of what the closure's weights give; None where the twin diverges, or trains nothing.
 
         The residuals over the segments that the last fit used tell the noise.
         """
-        if not records or not hasattr(self.twin.closure, "named_coefficients"):
+        if not records or not any(weight.requires_grad for weight in self.twin.closure.parameters()):
             return None
         replayed = self.in_segments(batch_of(records))
         read, noise = self._compared(replayed)
