@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from interval_coverage import CASES, coverage
+from interval_coverage import CASES, coverage, random_flight
 from seeds_and_numbers import double
 from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Sensor, sensor_record, sensors_of
+from rt_torchrl.fit.law import asked_features
 
 ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)
@@ -160,3 +161,23 @@ def test_intervals_hold_the_truth_on_each_plant(name):
     inside, error_over_bound = coverage(CASES[name], simulations=200)
     assert 0.90 <= inside <= 0.98
     assert (error_over_bound[~error_over_bound.isnan()] < 1.5).all()
+
+
+@pytest.mark.slow
+def test_the_errors_of_a_learned_polar_hold_the_truth():
+    """A perceptron beside a wrong polar, where four records of 1 % noise went; flat minima make the errors wide."""
+    case, generator = CASES["flapping_wing"], torch.Generator().manual_seed(0)
+    plant = case.plant()
+    sensors, true, held = sensors_of(plant, case.sensors), case.closure(plant), []
+    for _ in range(4):
+        flown = random_flight(plant, true, generator)
+        twin = DigitalTwin(plant, plant.make_neural_closure(generator, (8,)))
+        record = sensor_record(plant, sensors, flown)
+        noise = 0.01 * record.readings.std(0) * torch.randn(record.readings.shape, generator=generator).double()
+        record = record._replace(readings=record.readings + noise)
+        found = Estimation(twin, sensors, config=EstimationConfig(iterations=30)).run([record]).uncertainty
+        angles = asked_features(twin, [flown])[::97]
+        errors = found.errors_of(lambda twin=twin, angles=angles: twin.closure(angles))
+        assert errors.median() < 0.1
+        held.append((twin.closure(angles) - true(angles)).abs() < 1.96 * errors)
+    assert torch.cat(held).double().mean() > 0.95
