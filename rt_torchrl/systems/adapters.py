@@ -191,7 +191,8 @@ class FMUEnvironment(ForeignSystem):
         seed: int = 0,
     ):
         super().__init__({"outputs": len(outputs), "exogenous": len(plant.inputs)}, plant.actions, seed=seed)
-        self._fmpy, self.path, self.plant = _fmpy(), Path(path), plant
+        of_extra("fmpy.simulation", "fmu")
+        self._fmpy, self.path, self.plant = of_extra("fmpy", "fmu"), Path(path), plant
         try:
             self._description = self._fmpy.read_model_description(str(self.path))
         except Exception as error:  # FMPy raises whatever its parser meets
@@ -283,8 +284,3 @@ class FMUEnvironment(ForeignSystem):
         self._free()
         shutil.rmtree(self._folder, ignore_errors=True)
         super().close(**kwargs)
-
-
-def _fmpy() -> Any:
-    of_extra("fmpy.simulation", "fmu")
-    return of_extra("fmpy", "fmu")

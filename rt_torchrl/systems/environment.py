@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from rt_torchrl.options import require_number, require_range
 from rt_torchrl.plants.plant import Plant, with_memories
+from rt_torchrl.plants.shapes import Cost, State
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -104,9 +105,7 @@ class PlantEnv(EnvBase):
         self._step_count = 0
         if self.plant.ended(self._state).any():
             raise ValueError(f"plant {self.plant.name!r} draws initial states in which the episode has ended.")
-        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        false = torch.zeros(1, 1, dtype=torch.bool, device=self.device)
-        return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
+        return self._observed(at_start(self.plant, self.device))
 
     @property
     def drawn(self) -> tuple[Scenario, Float[Tensor, "1 n_s"]]:
@@ -126,20 +125,8 @@ class PlantEnv(EnvBase):
             )
         self._state = with_memories(self.plant, transition.state, t, self._state * self._factor, exogenous)
         self._step_count += 1
-        over = torch.full((1, 1), self._step_count >= self.plant.n_steps, device=self.device)
-        ends = self.plant.end_cost is not None
-        terminated = self.plant.ended(self._state).unsqueeze(-1) if ends else torch.zeros_like(over)
-        truncated = over & ~terminated
-        ended = truncated.squeeze(-1) * self.plant.terminal_cost(self._state) / self.plant.dt
-        return self._observed(
-            {
-                "applied": transition.applied.clone(),
-                "reward": -(cost + ended).unsqueeze(-1),
-                "done": truncated | terminated,
-                "terminated": terminated,
-                "truncated": truncated,
-            }
-        )
+        ends = at_end(self.plant, cost, self._state, last=self._step_count >= self.plant.n_steps)
+        return self._observed({"applied": transition.applied.clone()} | ends)
 
     def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
         t, exogenous = self._now()
@@ -164,6 +151,27 @@ class PlantEnv(EnvBase):
         k = self._step_count
         t = torch.full((1,), k * self.plant.dt, dtype=torch.float64, device=self.device)
         return t, self._exogenous[:, min(k, self.plant.n_steps - 1)]
+
+
+def at_start(plant: Plant, device: torch.device | None) -> dict[str, Tensor]:
+    """What a reset reports beside its readings: no action was applied, and the episode goes on."""
+    flags = {key: torch.zeros(1, 1, dtype=torch.bool, device=device) for key in ("done", "terminated", "truncated")}
+    return {"applied": torch.zeros(1, len(plant.actions), dtype=torch.float64, device=device)} | flags
+
+
+def at_end(plant: Plant, cost: Cost, end: State, *, last: bool) -> dict[str, Tensor]:
+    """The reward of a control interval, and whether the episode is over.
+
+    Args:
+        plant: the plant.
+        cost: running cost of the interval.
+        end: state at its end.
+        last: whether the horizon is reached, where the reward has the cost at the end.
+    """
+    terminated = plant.ended(end).unsqueeze(-1)
+    truncated = ~terminated & last
+    reward = -(cost + truncated.squeeze(-1) * plant.terminal_cost(end) / plant.dt).unsqueeze(-1)
+    return {"reward": reward, "done": truncated | terminated, "terminated": terminated, "truncated": truncated}
 
 
 def declare_specs(env: EnvBase, plant: Plant, *, refused: bool = False) -> None:

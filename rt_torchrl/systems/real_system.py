@@ -17,7 +17,7 @@ from rt_torchrl.export.controller import Controller
 from rt_torchrl.options import array_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.systems.environment import AroundSystem, declare_specs, ended_early, innermost, layers
+from rt_torchrl.systems.environment import AroundSystem, at_end, at_start, declare_specs, ended_early, innermost, layers
 
 
 def joined(*entries: Tensor) -> Tensor:
@@ -219,10 +219,7 @@ class RealSystem(EnvBase):
         """Refuse, before the first step and without moving anything real, an environment that would fail in it."""
         imagined = self.env.fake_tensordict()  # zeros; a reading of them need not be finite
         self._state.read(imagined, self._read, "state", finite=False)
-        if isinstance(self._exogenous, Reading):
-            self._exogenous.read(imagined, self.plant.inputs, "exogenous", finite=False)
-        else:
-            self._input(imagined)
+        self._input(imagined, finite=False)
         if self._applied is not None:
             self._applied.read(imagined["next"], self.plant.actions, "applied", finite=False)
         elif "applied" in self.env.full_observation_spec:
@@ -260,10 +257,10 @@ class RealSystem(EnvBase):
                     "narrow the plant's, or mend scale and offset of the actuation."
                 )
 
-    def _input(self, reported: TensorDictBase) -> Float[Tensor, "1 n_z"]:
+    def _input(self, reported: TensorDictBase, *, finite: bool = True) -> Float[Tensor, "1 n_z"]:
         inputs = self.plant.inputs
         if isinstance(self._exogenous, Reading):
-            return self._exogenous.read(reported, inputs, "exogenous")
+            return self._exogenous.read(reported, inputs, "exogenous", finite=finite)
         if len(self._exogenous) != len(inputs):
             names = [signal.name for signal in inputs]
             raise ValueError(f"exogenous={self._exogenous} must be a Reading, or a constant for each input of {names}.")
@@ -310,8 +307,7 @@ class RealSystem(EnvBase):
         return self._begun()
 
     def _begun(self) -> TensorDict:
-        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
-        return self._entries(self._reported, self._joined(self._reported), applied, ended=False)
+        return self._entries(self._reported, self._joined(self._reported), at_start(self.plant, self.device))
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -332,20 +328,14 @@ class RealSystem(EnvBase):
             interval = t, self._memory, known, exogenous, applied, measured
             self._memory = self._controller.advance(*(values.cpu() for values in interval))
         end = self._joined(stepped["next"])
-        over = self.plant.end_cost is not None and bool(self.plant.ended(end).any())
-        last = self._step_count >= self.plant.n_steps and not over
-        if stepped["next", "done"].any() and not (last or over):
+        cost = self.plant.running_cost(t, state, applied, exogenous)
+        ends = at_end(self.plant, cost, end, last=self._step_count >= self.plant.n_steps)
+        if stepped["next", "done"].any() and not ends["done"].any():
             raise ended_early(self._step_count, self.plant)
-        if (last or over) and hasattr(innermost(self.env), "end_episode"):
+        if ends["done"].any() and hasattr(innermost(self.env), "end_episode"):
             innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
-        cost = self.plant.running_cost(t, state, applied, exogenous)
-        after = self._entries(stepped["next"], end, applied, ended=last)
-        if over:
-            after["done"], after["terminated"] = (torch.ones_like(after["done"]) for _ in range(2))
-        if last:
-            cost = cost + self.plant.terminal_cost(after["state"]) / self.plant.dt
-        return after.set("reward", -cost.unsqueeze(-1))
+        return self._entries(stepped["next"], end, {"applied": applied} | ends)
 
     def _measured(self, reported: TensorDictBase) -> Tensor:
         """The states that the environment reports."""
@@ -358,15 +348,13 @@ class RealSystem(EnvBase):
             measured = self._controller.joined(measured.cpu(), self._memory)
         return measured.to(self.device)
 
-    def _entries(self, reported: TensorDictBase, state: Tensor, applied: Tensor, *, ended: bool) -> TensorDict:
-        """The environment's report in the plant's terms."""
+    def _entries(self, reported: TensorDictBase, state: Tensor, beside: dict[str, Tensor]) -> TensorDict:
+        """The environment's report in the plant's terms, with what is beside its readings."""
         exogenous = self._input(reported).to(self.device)
         self._present = state, exogenous
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
-        flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
         entries = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
-        entries |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag), "applied": applied}
-        entries |= {"refused": reported["refused"].reshape(1, 1)} if self._judged else {}
+        entries |= beside | ({"refused": reported["refused"].reshape(1, 1)} if self._judged else {})
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def close(self, **kwargs: Any) -> None:

@@ -79,10 +79,8 @@ class ActionLimits:
 
     def __init__(self, spec: TensorSpec, config: SafetyConfig):
         self.spec, low, high = spec, config.low, config.high
-        whole = torch.full(spec.shape, torch.inf, dtype=spec.dtype, device=spec.device)
-        system_range = getattr(spec.space, "low", -whole), getattr(spec.space, "high", whole)
-        self.low = system_range[0] if low is None else torch.maximum(system_range[0], self.constant("low", low))
-        self.high = system_range[1] if high is None else torch.minimum(system_range[1], self.constant("high", high))
+        self.low = spec.space.low if low is None else torch.maximum(spec.space.low, self.constant("low", low))
+        self.high = spec.space.high if high is None else torch.minimum(spec.space.high, self.constant("high", high))
         if not ((self.low <= self.high) & (self.low < math.inf) & (self.high > -math.inf)).all():
             raise ValueError(f"low={low} and high={high} leave no action of the system's own range {spec.space}.")
         self._increment = None if config.rates is None else config.interval * self.constant("rates", config.rates)
