@@ -136,7 +136,7 @@ def stopped(tmp_path_factory):
 
 def test_tensorboard_has_the_final_costs_and_the_table(stopped):
     tags = EventAccumulator(str(stopped[0])).Reload().Tags()
-    assert "final/J_a live" in tags["scalars"] and "results/text_summary" in tags["tensors"]
+    assert "final/unseen.J_a_model_free.mean" in tags["scalars"] and "results/text_summary" in tags["tensors"]
 
 
 def test_options_of_a_file_and_of_a_run_that_goes_on_hold_beside_those_that_are_given(tmp_path):

@@ -4,16 +4,14 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from rt_torchrl.runs.metrics import on_the_twin
 from rt_torchrl.runs.results import progress
-from rt_torchrl.steps.config import ROLES
+from rt_torchrl.runs.settings import flat
 from rt_torchrl.systems.operation import FIRST
 
 GROUPS = {
@@ -40,8 +38,10 @@ class Dashboard:
             summary: entry ``summary`` in ``metrics.json``.
             table: table of results.
         """
-        for name, value in final_costs(summary).items():
-            self._writer.add_scalar(f"final/{name}", value, 0)
+        judged = {key: summary[key] for key in ("unseen", "real_unseen", "cost_of_learning") if key in summary}
+        for name, value in flat(judged).items():
+            if name.endswith((".mean", ".sum", ".largest")) and value is not None:
+                self._writer.add_scalar(f"final/{name}", value, 0)
         # TensorBoard shows Markdown, in which indented lines are code.
         self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
@@ -75,19 +75,6 @@ def scalars_of(record: Mapping[str, Any]) -> dict[str, float]:
     return scalars | {f"seconds/{name}": seconds for name, seconds in record["seconds"].items()}
 
 
-def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Final costs of a run by name; those that are not finite are left out."""
-    unseen, paid = summary["unseen"], summary["cost_of_learning"]
-    where = " on the twin" if on_the_twin(unseen) else ""
-    costs = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in ROLES}
-    costs[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
-    costs |= {f"J_a {name}{where}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
-    flown = summary.get("real_unseen", {}).get("controllers", {})
-    costs |= {f"J_a {name} on the real system": entry["J_a"]["mean"] for name, entry in flown.items()}
-    costs |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
-    return {name: float(value) for name, value in costs.items() if value is not None and np.isfinite(value)}
-
-
 WORDS = {
     "start": "learning from what is known",
     "fit": "fitting the twin to what is known",
@@ -103,7 +90,7 @@ WORDS = {
 
 
 QUIET = 10.0
-"""Time for which a log says nothing before it names the step under way [s]."""
+"""Time after which a log that has said nothing names the step that begins [s]."""
 
 
 class Progress:
@@ -118,35 +105,27 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True, disable=None)
         self._total, self._line_at = total, -QUIET
         self._costs, self._doing, self._alarm = "", "starting", False
-        self._later = Timer(QUIET, self._log)
 
     def __enter__(self) -> "Progress":
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._later.cancel()
         self._doing = ""
         self._show()
         self._bar.close()
 
     def doing(self, what: str) -> None:
         """Show what begins now: the name of a step of the algorithm, or any other words."""
-        self._later.cancel()
         self._doing = WORDS.get(what, what)
         self._show()
         if time.monotonic() - self._line_at > QUIET:
             self._log(self._doing)
-            return
-        self._later = Timer(QUIET, self._log, (self._doing,))  # where it takes long
-        self._later.daemon = True
-        self._later.start()
 
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
 
         A line says when the twin's predictions begin or cease to be wrong, and why no policy may act.
         """
-        self._later.cancel()
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:
