@@ -19,6 +19,7 @@ from test_export_recipe import RECIPES, leave_run
 import rt_torchrl
 from rt_torchrl import AssimilationConfig, HypothesesConfig, Rollout, Trajectory, check_plant
 from rt_torchrl.atomic_file import write_json
+from rt_torchrl.steps.config import ROLES
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 
@@ -40,8 +41,8 @@ def leave_finished_run(folder):
         {"episode": k, "live": "model_based", "event": "keep", "real_cost": 0.1 - 0.01 * k, "J_p": 2.0, "seconds": {}}
         for k in range(2)
     ]
-    unseen = {"judged_on": "simulation", "baselines": {}, "merit": {"model_based": {}}} | {
-        "J_a_model_based": {"mean": 0.09}
+    unseen = {"judged_on": "simulation", "baselines": {}, "merit": dict.fromkeys(ROLES, {})} | {
+        f"J_a_{role}": {"mean": 0.09} for role in ROLES
     }
     summary = {"live": "model_based", "unseen": unseen, "twin": {"segment": 0}}
     write_json(folder / "metrics.json", {"episodes": episodes, "summary": summary})

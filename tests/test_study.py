@@ -34,6 +34,7 @@ def leave(folder, *, seed, costs, curve=(4.0, 2.0), arm="twinning", plant="tanks
         "costs": {"model_based": costs, "model_free": [9.0] * len(costs), "PI": [valve] * len(costs)},
         "merit": {"model_based": {"power [W]": {"mean": seed}}, "model_free": {"power [W]": {"mean": 0.0}}},
         "baselines": {"PI": {"merit": {"power [W]": {"mean": 5.0}}}},
+        **{f"J_a_{role}": {} for role in ("model_based", "model_free")},
     }
     episodes = [
         {"real_cost": 2.0 * cost if cost else cost, "J_a_unseen": cost, "seconds": {"plan": 1.5, "learn": 0.5}}

@@ -334,12 +334,13 @@ class Judged(NamedTuple):
     merit: dict[str, Costs]
 
     def statistics(self) -> dict[str, Any]:
-        """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median."""
+        """Number of ``episodes``; mean and interval of ``J_a`` and of each quantity in ``merit``, with its median."""
         merit = {
             name: mean_with_confidence(values) | {"median": values.median().item()}
             for name, values in self.merit.items()
         }
-        return {"J_a": mean_with_confidence(self.control_costs), "merit": merit}
+        count = len(self.control_costs)
+        return {"episodes": count, "J_a": mean_with_confidence(self.control_costs), "merit": merit}
 
 
 def mean_with_confidence(values: Float[Tensor, " n"], over: Float[Tensor, " n"] | None = None) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rt_torchrl.runs.metrics import judged_on_the_system, on_the_twin, read_metrics, real_costs
+from rt_torchrl.runs.metrics import judged_on_the_system, read_metrics, real_costs
 from rt_torchrl.runs.settings import BESIDE, BESIDE_TRAINING, flat, read_settings, task_of
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import ROLES, Role
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,21 +79,22 @@ class FinishedRun:
         """
         metrics = read_metrics(folder)
         summary, episodes = metrics["summary"], metrics["episodes"]
-        unseen, live = judged_on_the_system(summary), summary["live"]
+        (place, controllers, costs), live = judged_on_the_system(summary), summary["live"]
         judged = all("J_a_unseen" in episode for episode in episodes)
         return cls(
             folder=folder,
             settings=read_settings(folder),
-            place="real system" if on_the_twin(summary["unseen"]) else "simulation",
+            place=place,
             live=live,
-            costs=_numbers(unseen["costs"][live]),
+            costs=_numbers(costs[live]),
             curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
             judged=judged,
             real=_numbers(real_costs(episodes)),
-            merit=_means(unseen["merit"][live]),
+            merit=_means(controllers[live]["merit"]),
             controllers={
-                name: (statistics.fmean(_numbers(unseen["costs"][name])), _means(baseline["merit"]))
-                for name, baseline in unseen["baselines"].items()
+                name: (statistics.fmean(_numbers(costs[name])), _means(entry["merit"]))
+                for name, entry in controllers.items()
+                if name not in ROLES
             },
             alarms=sum(episode.get("alarm", 0.0) > 0.0 for episode in episodes),
             seconds=sum(sum(episode.get("seconds", {}).values()) for episode in episodes),

@@ -38,44 +38,47 @@ def on_the_twin(unseen: Mapping[str, Any]) -> bool:
     return unseen["judged_on"] == "twin"
 
 
-def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str, float], str]:
-    """J_a of the live policy, None if it is not finite; the finite ones of classical controllers; and where these hold.
+def by_place(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What controllers cost, by the place where they flew and their names: unseen episodes, and then the real system.
 
-    They are those of the flights on the real system, if the live policy has flown there, and else of unseen episodes: a
-    cost on the twin is not compared with one on the real system.
+    An entry has mean and interval of ``J_a`` and of each quantity in ``merit`` and, where the live policy flew the same
+    episodes, the ``ratio`` of its cost to that of the controller.
     """
-    judged, where = judged_at_the_end(summary)
-    means = {name: entry["J_a"]["mean"] for name, entry in judged.items()}
-    cost = means.pop(summary["live"])
-    return cost, {name: mean for name, mean in means.items() if mean is not None}, where
+    unseen = summary["unseen"]
+    policies = {role: {"J_a": unseen[f"J_a_{role}"], "merit": unseen["merit"][role]} for role in ROLES}
+    flown = {unseen["judged_on"]: policies | unseen["baselines"]}
+    return flown | ({"real system": summary["real_unseen"]["controllers"]} if "real_unseen" in summary else {})
 
 
 def judged_at_the_end(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
-    """What the live policy and classical controllers cost, by name, and where; see :func:`costs_at_the_end`."""
-    unseen, live = summary["unseen"], summary["live"]
-    flown = summary.get("real_unseen", {}).get("controllers", {})
-    if live in flown:
-        return flown, "real system"
-    return unseen["baselines"] | {live: {"J_a": unseen[f"J_a_{live}"]}}, unseen["judged_on"]
+    """What the live policy and others cost, and where: on the real system, if the live policy has flown there."""
+    flown = reversed(by_place(summary).items())
+    return next((controllers, place) for place, controllers in flown if summary["live"] in controllers)
 
 
-def judged_on_the_system(summary: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``costs``, ``merit`` and ``baselines`` of a run on the system, not on the run's own twin.
+def costs_at_the_end(summary: Mapping[str, Any]) -> tuple[float | None, dict[str, float], str]:
+    """J_a of the live policy, None if it is not finite; the finite ones of classical controllers; and where these hold.
 
-    They are those of the entry ``unseen``, or of the flights on the real system.
+    A cost on the twin is not compared with one on the real system, see :func:`judged_at_the_end`.
+    """
+    controllers, where = judged_at_the_end(summary)
+    means = {name: entry["J_a"]["mean"] for name, entry in controllers.items()}
+    known = {name: mean for name, mean in means.items() if name not in ROLES and mean is not None}
+    return means[summary["live"]], known, where
+
+
+def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[str, Mapping[str, Any], Mapping[str, Any]]:
+    """The place, what controllers cost there, and each of their costs: on the system, not on the run's own twin.
 
     Raises:
         ValueError: if the run was judged on its own twin alone.
     """
-    unseen = summary["unseen"]
-    if not on_the_twin(unseen):
-        return unseen
-    real = summary.get("real_unseen", {"controllers": {}})
-    if summary["live"] not in real["controllers"]:
-        raise ValueError(
-            "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run "
-            "by --resume and --real-unseen, which flies its live policy on the real system."
-        )
-    baselines = {name: entry for name, entry in real["controllers"].items() if name != summary["live"]}
-    merit = {name: entry["merit"] for name, entry in real["controllers"].items()}
-    return {"costs": real["costs"], "merit": merit, "baselines": baselines}
+    for place, controllers in by_place(summary).items():
+        if place != "twin" and summary["live"] in controllers:
+            real = place == "real system"
+            costs = summary["real_unseen" if real else "unseen"]["costs"]
+            return place if real else "simulation", controllers, costs
+    raise ValueError(
+        "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run by "
+        "--resume and --real-unseen, which flies its live policy on the real system."
+    )

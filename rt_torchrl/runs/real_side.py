@@ -150,10 +150,9 @@ def entries(
     """
     controllers = {}
     for name, judgement in judged.items():
-        costs = judgement.control_costs
-        controllers[name] = {"episodes": len(costs)} | judgement.statistics()
+        controllers[name] = judgement.statistics()
         if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
-            controllers[name] |= compared(judged[live].control_costs, costs)
+            controllers[name] |= compared(judged[live].control_costs, judgement.control_costs)
     return {
         "controllers": controllers,
         "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},

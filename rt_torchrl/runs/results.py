@@ -20,7 +20,7 @@ from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.console import call_of
-from rt_torchrl.runs.metrics import costs_at_the_end, judged_at_the_end, on_the_twin, real_costs
+from rt_torchrl.runs.metrics import by_place, costs_at_the_end, judged_at_the_end, on_the_twin, real_costs
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -158,30 +158,25 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     outputs of the closure that depend on its features are worth, see :func:`law_of`.
     """
     records, assimilation = list(algorithm.short_term), algorithm.assimilation
+    fitted: dict[str, Any] = {"segment": 0, "note": ""}
+    fitted |= {name: {} for name in ("rms", "noise", "standard_errors", "correlations", "law")}
     if not records or algorithm.config.arm == "model_free":
-        return {
-            "rms": {},
-            "segment": 0,
-            "noise": {},
-            "standard_errors": {},
-            "correlations": {},
-            "note": "",
-            "law": {},
-        }
+        return fitted
     plant = algorithm.twin.plant
     levels = zip(plant.readings, algorithm.twin.noise.tolist(), strict=True)
     sensors = [(signal, level) for signal, level in levels if level and signal.name not in plant.controller_states]
     latest, _ = algorithm.virtual.paired(records)
     uncertainty = assimilation.uncertainty(latest)
-    named = uncertainty if hasattr(algorithm.twin.believed.closure, "named_coefficients") else None
-    return {
+    if uncertainty is not None:
+        law = law_of(algorithm.twin, latest, uncertainty)
+        fitted |= {"note": not_white(uncertainty.likelihood), "law": law}
+        if hasattr(algorithm.twin.believed.closure, "named_coefficients"):
+            errors, correlations = uncertainty.standard_errors(), high_correlations(uncertainty)
+            fitted |= {"standard_errors": errors, "correlations": correlations}
+    return fitted | {
         "rms": assimilation.rms_errors(latest),
         "segment": assimilation.length,
         "noise": {f"{signal.name} [{signal.unit}]": level for signal, level in sensors},
-        "standard_errors": {} if named is None else named.standard_errors(),
-        "correlations": {} if named is None else high_correlations(named),
-        "note": "" if uncertainty is None else not_white(uncertainty.likelihood),
-        "law": {} if uncertainty is None else law_of(algorithm.twin, latest, uncertainty),
     }
 
 
@@ -346,12 +341,16 @@ def results_table(metrics: dict[str, Any]) -> str:
         best, share = (summary["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
         lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
-    for name, baseline in unseen["baselines"].items():
-        mean = _number(baseline["J_a"]["mean"], ".5g")
-        lines.append(f"  {f'J_a {name}{twin}':<{width}}{'':>12}{mean:>12}   {_interval(baseline['J_a'])}")
-        lines.append(beside_line(baseline, unseen["episodes"]))
-    lines += merit_lines(unseen)
-    lines += real_lines(summary.get("real_unseen"), fitted["segment"])
+    lines += controller_lines(unseen["baselines"], twin, width)
+    simulated, *real = by_place(summary).values()
+    lines += merit_lines(simulated, twin)
+    for controllers in real:
+        over = f", over segments of {fitted['segment']} intervals" if fitted["segment"] else ""
+        if "J_p" in summary["real_unseen"]:
+            before, after = (_number(summary["real_unseen"][key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
+            lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
+        lines += controller_lines(controllers, " on the real system", width)
+        lines += merit_lines(controllers, " on the real system")
     whole, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     after = f", {len(paid['judging'])} of them after the training" if "judging" in paid else ""
     lines.append(
@@ -386,28 +385,17 @@ def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
     return [line + (f"; the idle one became a clone after episode {clones[-1]}" if clones else "")]
 
 
-def real_lines(real: dict[str, Any] | None, segment: int) -> list[str]:
-    """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
-    if real is None:
-        return []
+def controller_lines(controllers: Mapping[str, Any], where: str, width: int) -> list[str]:
+    """Lines with what controllers cost, and what the live policy costs beside each in the same episodes."""
     lines = []
-    if "J_p" in real:
-        before, after = (_number(real[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
-        over = f", over segments of {segment} intervals" if segment else ""
-        lines.append(f"  J_p on the real system{over}: {after}, with the first closure {before}")
-    for name, entry in real["controllers"].items():
-        mean, who = f"{_number(entry['J_a']['mean'], '.5g')} {_interval(entry['J_a'])}", name.replace("_", "-")
-        lines.append(f"  J_a on the real system, {entry['episodes']} other episodes of {who}: {mean}")
+    for name, entry in controllers.items():
+        mean, label = _number(entry["J_a"]["mean"], ".5g"), f"J_a {name.replace('_', '-')}{where}"
+        lines.append(f"  {label:<{width}}{'':>12}{mean:>12}   {_interval(entry['J_a'])}")
         if "ratio" in entry:
-            lines.append(beside_line(entry, entry["episodes"]))
-        lines += [f"    {quantity:<26}{_value(merit):>20}" for quantity, merit in entry["merit"].items()]
+            ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
+            cheaper = f"cheaper in {entry['cheaper']} of {entry['episodes']}"
+            lines.append(f"    on the same episodes the live policy costs {ratio} of it, {cheaper}")
     return lines
-
-
-def beside_line(entry: dict[str, Any], episodes: int) -> str:
-    """A line with what the live policy costs beside a controller in the same episodes."""
-    ratio = f"{_number(entry['ratio']['mean'], '.4g')} {_interval(entry['ratio'])}"
-    return f"    on the same episodes the live policy costs {ratio} of it, cheaper in {entry['cheaper']} of {episodes}"
 
 
 def _number(value: float | None, digits: str) -> str:
@@ -420,16 +408,15 @@ def _interval(statistics: dict[str, Any]) -> str:
     return f"[{low}, {high}]"
 
 
-def merit_lines(unseen: dict[str, Any]) -> list[str]:
+def merit_lines(controllers: Mapping[str, Any], where: str) -> list[str]:
     """Lines with the plant's own quantities under every controller."""
-    merits: dict[str, dict[str, Any]] = {role: unseen["merit"][role] for role in ROLES}
-    merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
-    if not merits[ROLES[0]]:
+    merits: list[dict[str, Any]] = [entry["merit"] for entry in controllers.values()]
+    if not merits[0]:
         return []
-    heading = "on the twin, mean (median)" if on_the_twin(unseen) else "mean (median)"
-    lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
-    for name in merits[ROLES[0]]:
-        lines.append(f"    {name:<26}" + "".join(f"{_value(merit[name]):>20}" for merit in merits.values()))
+    heading = f"mean (median){where}"
+    lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in controllers)]
+    for name in merits[0]:
+        lines.append(f"    {name:<26}" + "".join(f"{_value(merit[name]):>20}" for merit in merits))
     return lines
 
 
@@ -557,18 +544,17 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     best = min(known, key=known.__getitem__, default=None)
     call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
+    rival = best if best is not None and not clearly_cheaper(summary, best) else None
+    if rival is None and (twin or best is None) and dearer_than_first(summary):
+        rival = "the controller that flew first"
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
-    elif best is not None and cost < known[best] and not clearly_cheaper(summary, best):
+    elif rival is not None:
         steps.append(
-            f"the live policy is not clearly better than {best}: keep {best}, let the policy observe what {best} "
-            "computes, or judge both in more episodes (--unseen, on a real system --real-unseen)"
+            f"the live policy is not clearly better than {rival}: keep it, let the policy observe what it computes, "
+            "train with more --twinning.planner.iterations, or judge both in more episodes (--unseen, --real-unseen)"
         )
-    elif (best is not None and cost >= known[best]) or ((twin or best is None) and dearer_than_first(summary)):
-        better = best if best is not None and cost >= known[best] else "the controller that flew first"
-        other = "let the policy observe what that controller computes, or train with more --twinning.planner.iterations"
-        steps.append(f"{better} is better than the live policy: keep it, {other}")
     elif summary["better"] != live:
         steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
     elif not alone:
