@@ -7,7 +7,7 @@ the steps:
 | key | shape, unit | written by | read by |
 |---|---|---|---|
 | ``number`` | number of the episode, from 0 | the algorithm | 1, 5 |
-| ``live`` | role of the policy that acts | the algorithm, 1 | 1, 6 |
+| ``live`` | role of the policy that acts | the algorithm, 1 | 1, 4, 6 |
 | ``record/states``, ``actions``, ``exogenous``, ``start`` | n+1 × n_s, n × n_a, n × n_z, [s] | 1 | 3, 4, 6 |
 | ``record/whole`` | whether it is that of a whole episode, to its horizon or to its early end | 1 | 3, 4 |
 | ``transitions/k`` | n_k transitions of each sound part | 1 | 2 |
@@ -55,7 +55,7 @@ from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation import Operation, system_of
+from rt_torchrl.systems.operation import FIRST, Operation, system_of
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import batch_of
@@ -246,7 +246,7 @@ class ReinforcementTwinning(TensorDictSequential):
             self.steps["learn"].store(flight.parts)
             self.short_term.append(flight.record)
             if self.first.teacher is not None:
-                self.belief.append_first(flight.record, flight.cost.item())
+                self.belief.append(flight.record, FIRST, flight.cost.item())
             if on_twin:
                 self.virtual.learn(flight.record)
         if on_twin:

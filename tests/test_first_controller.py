@@ -132,7 +132,7 @@ def test_a_twin_that_overstates_costs_refuses_no_clone_of_the_controller():
 def test_a_controller_whose_costs_have_no_ratio_is_named():
     found, record = started()
     with pytest.raises(ValueError, match=r"J_a=-1 of a real episode of plant .* is negative"):
-        found.belief.append_first(record, -1.0)
+        found.belief.append(record, "first", -1.0)
     found.belief.first = [found.belief.first[0]._replace(cost=0.0)]
     # Nor does the twin alone know a controller.
     for each in (found, started(referee=RefereeConfig(rule="decision_tree"))[0]):

@@ -30,6 +30,7 @@ from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ESTIMABLE, AssimilationConfig
 from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.steps.report import Step, merged, metrics
+from rt_torchrl.systems.operation import FIRST
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -320,7 +321,7 @@ class Assimilation:
 class Assimilate(Step):
     """Step 4: descend J_p over the latest records, and explain what real episodes cost other than the twin says.
 
-    Reads ``record`` and ``large_scale``, of which the memory D_S and the processes hold more. Writes ``J_p_before`` and
+    Reads ``live``, ``record`` and ``large_scale``, of which the memory D_S and the processes hold more. Writes ``J_p_before`` and
     ``J_p``, the cost of the twin on the records before and after.
 
     Args:
@@ -331,7 +332,7 @@ class Assimilate(Step):
         generator: source of the draws.
     """
 
-    in_keys = ["record", "large_scale"]
+    in_keys = ["record", "large_scale", "live"]
     out_keys = ["J_p_before", "J_p"]
 
     def __init__(
@@ -352,7 +353,8 @@ class Assimilate(Step):
         report = self.fit(list(self.short_term))
         if self.assimilation.explain(self.belief.unexplained, self.generator):
             report.update(metrics(**self.assimilation.report()))
-        if episode["record", "whole"]:  # a part costs other than the episodes that the twin flies
+        # A part costs other than the episodes that the twin flies, and of the first controller it predicts nothing.
+        if episode["record", "whole"] and episode["live"] != FIRST:
             report = merged(report, self.belief.examine())
         return merged(episode, report)
 

@@ -26,7 +26,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -39,9 +39,10 @@ from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.steps.config import Role
+from rt_torchrl.steps.config import Pilot, Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.report import metrics, same_architecture
+from rt_torchrl.systems.operation import FIRST
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -73,21 +74,15 @@ NOISY_FLIGHTS = 16
 class Flown(NamedTuple):
     """A real episode: its trajectory, the role and weights of the policy that flew it, and its J_a.
 
-    ``deviation`` is what it has explored beside the policy's actions; None for nothing.
+    ``role`` is ``first`` for the controller that flew first. ``deviation`` is what the episode has explored beside the
+    policy's actions; None for nothing.
     """
 
     trajectory: Trajectory
-    role: Role
+    role: Pilot
     weights: dict[str, Tensor]
     cost: float
     deviation: Tensor | None = None
-
-
-class FirstFlown(NamedTuple):
-    """A real episode of the controller that flew first: its trajectory, and its J_a."""
-
-    trajectory: Trajectory
-    cost: float
 
 
 class Judged(NamedTuple):
@@ -131,9 +126,8 @@ class Belief:
         self.virtual, self.corrects = virtual, corrects
         self.policies = policies
         self.flown: list[Flown] = []
-        self.first: list[FirstFlown] = []
+        self.first: list[Flown] = []
         """The latest episodes of the controller that flew first."""
-        self._policy_flew = True
         self._state: dict[str, Any] | None = None
         self._results: dict[str | int, Any] = {}
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
@@ -143,7 +137,7 @@ class Belief:
     def append(
         self,
         trajectory: Trajectory,
-        role: Role,
+        role: Pilot,
         cost: float,
         weights: Mapping[str, Tensor] | None = None,
         commands: Float[Tensor, "n n_a"] | None = None,
@@ -152,7 +146,7 @@ class Belief:
 
         Args:
             trajectory: what sensors have read, and what was applied.
-            role: role of the policy.
+            role: role of the policy; ``first`` for the controller with which the training has begun.
             cost: J_a as measured.
             weights: weights of the policy; None for the present ones.
             commands: commands with what they have explored; None for those of the policy.
@@ -160,14 +154,22 @@ class Belief:
         Raises:
             ValueError: if the cost is negative, because differences are logs of the ratio of two costs.
         """
-        self._require_ratio(cost)
+        if cost < 0.0 and self.corrects:
+            raise ValueError(
+                f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training "
+                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
+                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
+            )
+        if role == FIRST:
+            self.first = [*self.first, Flown(trajectory, role, {}, cost)][-ANCHORS:]
+            return
         weights = self.policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         flown = Flown(trajectory, role, weights, cost)
         if commands is not None:
             flown = flown._replace(deviation=self._deviation(flown, commands))
         self.flown = [*self.flown, flown][-HISTORY:]
-        self._state, self._policy_flew = None, True
+        self._state = None
 
     def _kept(self, name: str | int, compute: Callable[[], Any]) -> Any:
         """What is computed of the present twin and the episodes, once until one of both changes."""
@@ -189,25 +191,6 @@ class Belief:
         deviation = commands - policy(plant.observe(t, states, record.exogenous))
         low, high = bounds(plant.actions, device=states.device)
         return deviation.unsqueeze(0) if (deviation.abs() > ROUNDING * (high - low)).any() else None
-
-    def _require_ratio(self, cost: float) -> None:
-        """Refuse a negative cost, because a paired difference is the log of the ratio of two costs."""
-        if cost < 0.0 and self.corrects:
-            raise ValueError(
-                f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training "
-                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
-                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
-            )
-
-    def append_first(self, trajectory: Trajectory, cost: float) -> None:
-        """Add an episode that the controller has flown with which the training has begun.
-
-        Raises:
-            ValueError: if the cost is negative.
-        """
-        self._require_ratio(cost)
-        self.first = [*self.first, FirstFlown(trajectory, cost)][-ANCHORS:]
-        self._policy_flew = False
 
     @torch.no_grad()
     def beside_first(self, policy: nn.Module, controller: nn.Module | None) -> tuple[float, float] | None:
@@ -243,9 +226,10 @@ class Belief:
 
         There is one copy for each role, because the twin keeps the code of few modules.
         """
-        if flown.role not in self._copies:
-            self._copies[flown.role] = copy.deepcopy(self.policies[flown.role])
-        policy = self._copies[flown.role]
+        role = cast(Role, flown.role)
+        if role not in self._copies:
+            self._copies[role] = copy.deepcopy(self.policies[role])
+        policy = self._copies[role]
         policy.load_state_dict(flown.weights)
         return policy
 
@@ -264,10 +248,10 @@ class Belief:
         return costs
 
     def _flown_again(self, flown: Flown) -> float:
-        if isinstance(self.policies[flown.role], StateFeedback):
+        policy, episode = self.policy_of(flown), self.virtual.repeated(flown.trajectory)
+        if isinstance(policy, StateFeedback):
             return math.nan
-        episode = self.virtual.repeated(flown.trajectory)
-        return self.virtual.cost(self.policy_of(flown), episode, explored(flown, episode))
+        return self.virtual.cost(policy, episode, explored(flown, episode))
 
     def _beyond_noise(self, k: int, d: float) -> float:
         """The paired difference d of an episode beyond what other noise of the sensors explains of a large one.
@@ -309,11 +293,10 @@ class Belief:
 
         Returns:
             ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1, or a
-            ``reason`` if noise of the sensors explains it. Nothing if state feedback or the controller that flew first
-            flew it.
+            ``reason`` if noise of the sensors explains it. Nothing if state feedback flew it.
         """
         differences = self.differences()
-        if not differences or math.isnan(differences[-1]) or not self._policy_flew:
+        if not differences or math.isnan(differences[-1]):
             return metrics()
         known = [(k, d) for k, d in enumerate(differences) if not math.isnan(d)]
         beyond_noise = [self._beyond_noise(k, d) for k, d in known[-2:]]
@@ -509,14 +492,12 @@ class Belief:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        def saved(flights: Sequence[Flown | FirstFlown]) -> list[dict[str, Any]]:
-            return [flight._asdict() | {"trajectory": flight.trajectory._asdict()} for flight in flights]
-
-        return {"flown": saved(self.flown), "first": saved(self.first)}
+        return {"flights": [f._asdict() | {"trajectory": f.trajectory._asdict()} for f in (*self.first, *self.flown)]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.flown = [Flown(**saved | {"trajectory": Trajectory(**saved["trajectory"])}) for saved in state["flown"]]
-        self.first = [FirstFlown(Trajectory(**saved["trajectory"]), saved["cost"]) for saved in state["first"]]
+        flights = [Flown(**saved | {"trajectory": Trajectory(**saved["trajectory"])}) for saved in state["flights"]]
+        self.first = [flight for flight in flights if flight.role == FIRST]
+        self.flown = [flight for flight in flights if flight.role != FIRST]
         self._state = None
 
 

@@ -12,6 +12,7 @@ from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 
 Role = Literal["model_free", "model_based"]
+Pilot = Role | Literal["first"]
 Arm = Literal["twinning", "model_free", "model_based"]
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 EXPERIENCE = 100

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role, TwinningConfig
+from rt_torchrl.steps.config import Pilot, Role, TwinningConfig
 from rt_torchrl.steps.report import Step, in_words, merged, metrics
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
@@ -194,7 +194,7 @@ class Supervisor:
         """The role and weights that were cleared last."""
 
     @torch.no_grad()
-    def choose(self, live: Role) -> tuple[nn.Module, str, dict[str, float | str]]:
+    def choose(self, live: Role) -> tuple[nn.Module, Pilot, dict[str, float | str]]:
         """What may act.
 
         Args:
@@ -339,15 +339,11 @@ class Interact(Step):
         acted = policy.report() if isinstance(policy, StateFeedback) else {}
         return [flight], metrics(exploration=strength, live=role, **report, **acted)
 
-    def keep(self, flight: Flight, pilot: str, weights: Mapping[str, Tensor]) -> None:
+    def keep(self, flight: Flight, pilot: Pilot, weights: Mapping[str, Tensor]) -> None:
         """Remember the record of a flight and, if it is one of a whole episode, what it cost."""
         self.short_term.append(flight.record)
-        if not flight.whole:  # costs of parts cannot be compared with those of episodes
-            return
-        if pilot == FIRST:
-            self.belief.append_first(flight.record, flight.cost.item())
-        else:
-            self.belief.append(flight.record, cast(Role, pilot), flight.cost.item(), weights, flight.commands)
+        if flight.whole:  # costs of parts cannot be compared with those of episodes
+            self.belief.append(flight.record, pilot, flight.cost.item(), weights, flight.commands)
 
     def fly_first(self, policy: nn.Module) -> Flight:
         """Fly one whole episode without exploration."""
@@ -403,7 +399,7 @@ class Operate(Interact):
             versions, counts = flights[-1].transitions["version"].unique(return_counts=True)
             order = self.operation.orders[int(versions[counts == counts.max()].max())]
             policy_flew |= order.version > 0 or order.name != FIRST
-            self.keep(flights[-1], order.name, order.weights)
+            self.keep(flights[-1], cast(Pilot, order.name), order.weights)
         report = metrics(
             windows=float(len(flights)),
             version=float(order.version),

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -33,7 +33,7 @@ from rt_torchrl.systems.safety import SafetyReport, report_of
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
-FIRST = "first"
+FIRST: Final = "first"
 """Name of the policy or state feedback that acts before the trained policies do."""
 HANDOVER = 20
 """Number of control intervals in which an offset of a handover as wide as the range of the action fades."""
