@@ -45,14 +45,13 @@ from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, Operate, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import EpisodeReport, merged, metrics
 from rt_torchrl.steps.start import Start, first_live
-from rt_torchrl.steps.switch import Referee, Switch, make_referee
+from rt_torchrl.steps.switch import Imitation, Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, system_of
@@ -252,7 +251,7 @@ class ReinforcementTwinning(TensorDictSequential):
         if on_twin:
             tell("fit")
             self.steps["assimilate"].fit(records)
-            self.assimilation.explain(self.belief.replayed(records, counted), self.generator)
+            self.assimilation.explain(self.belief.replayed(records, counted))
         tell("imitation")
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)

@@ -27,7 +27,7 @@ def lines():
 
 def test_weights_are_those_of_a_regression_with_a_start_for_each_record():
     records, closure = lines(), Slope()
-    found = assimilation(Line(), closure).update(records, [], 1, torch.Generator())
+    found = assimilation(Line(), closure).update(records)
     times, X, y = 0.1 * np.arange(101), np.zeros((202, 4)), np.concatenate([r.states[:, 0].numpy() for r in records])
     for k, z in enumerate(WINDS):
         rows = slice(101 * k, 101 * (k + 1))
@@ -37,7 +37,7 @@ def test_weights_are_those_of_a_regression_with_a_start_for_each_record():
     np.testing.assert_allclose(closure.w.detach().numpy(), solution[2:], atol=1e-6)
     assert found.best == pytest.approx(0.1 * 0.5 * residual[0] / 2, rel=1e-7)  # mean over the records
     fixed = Slope()
-    assimilation(Line(), fixed, initial="measured").update(records, [], 1, torch.Generator())
+    assimilation(Line(), fixed, initial="measured").update(records)
     # A standard error is 0.03 or so: the pinned start moves the slope by about as much.
     assert (fixed.w - closure.w).abs().max() > 0.02
 
@@ -47,7 +47,7 @@ def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
     """Segments begin with what was read before the fit, and with what suits them best after it if that is estimated."""
     record, closure = lines()[0], Slope()
     fit = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
-    found = fit.update([record], [], 1, torch.Generator())
+    found = fit.update([record])
     times, x = 0.1 * np.arange(101), record.states[:, 0].numpy()
     for weights, J_p, free in ((Slope().w, found.start, False), (closure.w, found.best, initial == "estimated")):
         left = x - (weights[0] + WINDS[0] * weights[1]).item() * times
@@ -57,7 +57,7 @@ def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
     samples = parts if initial == "estimated" else parts[:, 1:]
     assert fit.report() == {"rms/position [m]": pytest.approx(np.sqrt((samples**2).mean()), rel=1e-6)}
     for length, used in ((7, 7), (50, 20)):  # a shorter record shortens no segments of later ones
-        fit.update([record.part(0, length, 0.1)], [], 1, torch.Generator())
+        fit.update([record.part(0, length, 0.1)])
         assert fit.length == used
 
 
@@ -74,9 +74,9 @@ def test_noise_of_the_sensors_decides_whether_first_states_are_estimated():
     ):
         chosen, given = Slope(), Slope()
         fit = assimilation(Line(), chosen, initial=None, **options)
-        found = fit.update(records, [], 1, torch.Generator())
+        found = fit.update(records)
         initial = "estimated" if estimates else "measured"
-        asked = assimilation(Line(), given, initial=initial, **options).update(records, [], 1, torch.Generator())
+        asked = assimilation(Line(), given, initial=initial, **options).update(records)
         assert fit.estimates == estimates and torch.equal(chosen.w, given.w) and found == asked
         fits.append(fit)
     fits[-1].load_state_dict(fits[0].state_dict())
@@ -123,7 +123,7 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     noise[0] = 0.0
     fit = assimilation(plant, closure, initial="measured")
     record = line_segment(0.7 * times + noise, wind=0.0)
-    fit.update([record], [], 1, generator)
+    fit.update([record])
     (error,) = fit.uncertainty([record]).standard_errors().values()
     assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)

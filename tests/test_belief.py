@@ -13,11 +13,10 @@ from test_algorithm import flown, twinning
 from rt_torchrl import DescentConfig, DigitalTwin, ExplorationConfig, Rollout, Scenario
 from rt_torchrl.steps.belief import HISTORY, Belief, alarm, difference
 from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
-from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.learn import Learn
 from rt_torchrl.steps.report import metrics
-from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost
+from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost, Imitation
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
 

@@ -89,7 +89,7 @@ def test_the_extension_of_the_documentation_finds_a_leak():
     config = HypothesesConfig(call=0.0, which=("leaks", "pump lags"))
     twin = make_twin(tank, tank.make_closure(generator), config)
     fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
-    EnsembleAssimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)
+    EnsembleAssimilation(twin, fit, config).update([Trajectory(*record)])
     found = twin.twins["leaks"].closure.named_coefficients()
     assert twin.weights == {"leaks": 1.0} and found["leak"].item() == pytest.approx(4e-3, rel=1e-3)
     assert found["lower_outlet"].item() == pytest.approx(4e-5, rel=1e-2)

@@ -21,11 +21,11 @@ from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.interact import RealFlights
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
+from rt_torchrl.steps.switch import Imitation
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.trajectory import batch_of, continued

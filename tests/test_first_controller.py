@@ -9,7 +9,7 @@ from test_classical import PD
 
 from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.runs.results import first_there
-from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.switch import Imitation
 from rt_torchrl.trajectories.trajectory import control_cost
 
 GAINS = (0.4, 0.3)

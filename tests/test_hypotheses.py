@@ -57,7 +57,7 @@ def ensemble(plant, call=0.0, *, always=False, **options):
 def fitted(real, plant, **options):
     twin, assimilation = ensemble(plant, **options)
     record, _ = recorded(real)
-    assimilation.update([record], (), 1, torch.Generator())
+    assimilation.update([record])
     return twin, assimilation
 
 
@@ -126,10 +126,10 @@ def whole_cost(twin, record):
 
 def test_an_episode_reports_the_twin_that_is_believed():
     """J_p before is that of the closure that was believed before the fit, on the record that it has not seen."""
-    real, generator = LaggedActuator(PLANT, "force", LAG), torch.Generator()
+    real = LaggedActuator(PLANT, "force", LAG)
     (record, _), shorter = recorded(real), recorded(real, steps=50)[0]
     twin, assimilation = ensemble(PLANT)
-    found = assimilation.update([shorter], (), 1, generator)
+    found = assimilation.update([shorter])
     first, lagged = assimilation.report(), twin.twins["lags"]
     assert first["believed"] == "lags" and "J_p_before" not in first  # which is that of the twin alone
     assert first["J_p"] == pytest.approx(whole_cost(lagged, shorter)) and first["J_p"] < 1e-3 * found.best
@@ -137,7 +137,7 @@ def test_an_episode_reports_the_twin_that_is_believed():
         for weight in lagged.closure.own.parameters():
             weight.add_(0.5)
     expected = whole_cost(lagged, record)
-    alone = assimilation.update([record], (), 1, generator)
+    alone = assimilation.update([record])
     second = assimilation.report()
     assert second["J_p_before"] == pytest.approx(expected) and expected != pytest.approx(alone.start, rel=0.1)
     assert second["J_p"] == pytest.approx(whole_cost(lagged, record)) and second["J_p"] < 1e-3 * expected
@@ -187,16 +187,16 @@ def test_weights_ask_for_evidence():
 
 def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(monkeypatch):
     twin, assimilation = ensemble(PLANT, call=0.05)
-    (lagging, _), generator = recorded(LaggedActuator(PLANT, "force", LAG)), torch.Generator()
-    assimilation.update([lagging], (), 1, generator)
-    assert not assimilation.explain(0.04, generator)
+    lagging, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    assimilation.update([lagging])
+    assert not assimilation.explain(0.04)
     weights = {name: share for name, share in assimilation.report().items() if not name.startswith("rms/")}
     assert twin.weights == {ALONE: 1.0} and weights == {f"hypothesis/{n}": n == ALONE for n in twin.twins}
-    assert assimilation.explain(0.06, generator) and twin.weights == {"lags": 1.0}
+    assert assimilation.explain(0.06) and twin.weights == {"lags": 1.0}
     # The one that explains the records stays, and is fitted to each new one.
-    assert not assimilation.explain(0.0, generator) and assimilation.called
+    assert not assimilation.explain(0.0) and assimilation.called
     twin.weights = {ALONE: 1.0}
-    assert not assimilation.explain(0.0, generator) and not assimilation.called
+    assert not assimilation.explain(0.0) and not assimilation.called
 
 
 @pytest.mark.parametrize("always", [False, True])
@@ -217,7 +217,7 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
     for done in range(14):
         if done == 13:
             twin.retreat()
-        found = assimilation.update([record], (), 1, torch.Generator())
+        found = assimilation.update([record])
         rested = done not in fitted_in
         assert math.isnan(found.gradient) == rested and math.isfinite(found.best)
         assert not rested or found.best == pytest.approx(assimilation.cost_of(batch_of([record])))

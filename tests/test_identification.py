@@ -115,7 +115,7 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
     for segment, close in ((None, True), (0, False)):
         closure = Joints(torch.tensor([1.0, 0.6, 0.5, 0.5]))
         config = AssimilationConfig(iterations=60, inputs="record", method="levenberg_marquardt", segment=segment)
-        Assimilation(DigitalTwin(plant, closure), config).update(noisy.each(), [], 1, generator)
+        Assimilation(DigitalTwin(plant, closure), config).update(noisy.each())
         assert torch.allclose(closure.coefficients, plant.closure.coefficients, rtol=0.05) is close
     # A twin that explains the readings over whole records is fitted over these.
     calm = [record.part(0, 20, plant.dt) for record in records]
@@ -199,7 +199,7 @@ def test_a_twin_that_diverges_over_whole_records_begins_with_what_short_segments
     config = AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt")
     fit = Assimilation(twin, config)
     assert fit.cost_of(batch_of([record])) == np.inf
-    found = fit.update([record], [], 1, torch.Generator())
+    found = fit.update([record])
     assert fit.length == 0 and found.start == np.inf and found.best < 1e-10
     assert closure.coefficients.item() == pytest.approx(0.5, rel=1e-4)
 

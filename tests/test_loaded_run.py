@@ -23,7 +23,7 @@ from rt_torchrl.runs import settings as settings_module
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.steps.imitation import clones
+from rt_torchrl.steps.switch import clones
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
 WITHOUT_NEURAL_CLOSURE = ("pendulum",)

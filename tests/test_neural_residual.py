@@ -167,7 +167,7 @@ def learned(real, names, noise=0.0):
     plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, which=names)
     twin = make_twin(plant, LinearClosure([[0.0, 0.0], [0.0, 0.0]]), config)
     assimilation = EnsembleAssimilation(twin, ASSIMILATION, config)
-    assimilation.update(list(records(real, noise)), (), 1, torch.Generator())
+    assimilation.update(list(records(real, noise)))
     return twin, assimilation.misfits
 
 
@@ -208,11 +208,11 @@ def test_a_fit_goes_on_as_without_a_resumption_where_the_last_weights_diverge():
     for _ in range(2):
         closure = plant.extended(LinearClosure([[0.0, 0.0], [0.0, 0.0]]))
         fits.append(Fit(DigitalTwin(plant, closure), ASSIMILATION, 25))
-    fits[0].update([record], torch.Generator())
+    fits[0].update([record])
     fits[1].load_state_dict(copy.deepcopy(fits[0].state_dict()))
     for fit in fits:
         fit.twin.closure.base.matrix.data.fill_(1e9)
-        fit.update([record], torch.Generator())
+        fit.update([record])
     one, other = (fit.twin.closure.state_dict() for fit in fits)
     assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -294,7 +294,7 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
         start = parameters_to_vector(twin.closure.correction.parameters()).detach()
         config = AssimilationConfig(prior=prior, inputs="record", method="levenberg_marquardt", iterations=40)
         assimilation = Assimilation(twin, config)
-        assimilation.update([flown.each()[0]], [], 1, seeded())
+        assimilation.update([flown.each()[0]])
         away = parameters_to_vector(twin.closure.correction.parameters()).detach() - start
         moved.append(away.norm().item())
         found = assimilation.likelihood(flown).normal_equations()

@@ -18,7 +18,7 @@ from test_faults import require_true
 
 import rt_torchrl as rt
 from rt_torchrl.runs.real_side import learner_threads
-from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.switch import Imitation
 from rt_torchrl.systems import operation as module
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
 from rt_torchrl.systems.operation import FIRST, Operation, Operator

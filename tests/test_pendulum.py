@@ -95,7 +95,7 @@ def test_mass_and_length_follow_from_one_episode(shares):
     plant = Pendulum()
     closure = UniformRod(torch.tensor(shares, dtype=torch.float64))
     config = AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10)
-    Assimilation(DigitalTwin(plant, closure), config).update([a_record(plant, 0)], [], 1, seeded())
+    Assimilation(DigitalTwin(plant, closure), config).update([a_record(plant, 0)])
     # Single precision of what is reported, over 2000 numbers.
     torch.testing.assert_close(closure.coefficients.detach(), torch.ones(2).double(), rtol=1e-5, atol=0)
 

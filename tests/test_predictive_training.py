@@ -13,7 +13,7 @@ from test_export_recipe import RECIPES, recipe
 from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.config import ROLES
-from rt_torchrl.steps.imitation import Imitation, clones
+from rt_torchrl.steps.switch import Imitation, clones
 
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")

@@ -254,7 +254,7 @@ def test_a_training_that_begins_with_a_slow_log_compares_its_rows_alone(options)
     assert record.seen.nonzero().flatten().tolist() == list(range(0, 591, 10))
     closure = LinearClosure(torch.zeros(2, 2))
     config = AssimilationConfig(iterations=200, inputs="record", **options)
-    found = Assimilation(DigitalTwin(plant, closure), config).update([record], [], 1, torch.Generator())
+    found = Assimilation(DigitalTwin(plant, closure), config).update([record])
     assert found.best < 1e-8 * found.start
     torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-3)
     short = reread(record, plant, 12).exogenous[:, -1]

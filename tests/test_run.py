@@ -15,10 +15,9 @@ from torchrl.collectors import Collector
 
 import rt_torchrl as rt
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
-from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
 from rt_torchrl.steps.plan import MultiStart, make_planner
-from rt_torchrl.steps.switch import make_referee
+from rt_torchrl.steps.switch import clones, make_referee
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):

@@ -18,8 +18,8 @@ from rt_torchrl import PlantEnv, Run, RunConfig, SaturatedMLP, Signal, Trajector
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig
-from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.start import transitions_of
+from rt_torchrl.steps.switch import clones
 
 record_log = recipe("record_log")
 recorded = record_log.recorded

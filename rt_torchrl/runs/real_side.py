@@ -17,8 +17,8 @@ from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import Role
-from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.start import Start
+from rt_torchrl.steps.switch import clones
 from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation import FIRST, Operation, Operator

@@ -24,9 +24,8 @@ from rt_torchrl.runs.metrics import by_place, costs_at_the_end, judged_at_the_en
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.steps.report import in_words
-from rt_torchrl.steps.switch import other_than
+from rt_torchrl.steps.switch import of_each_role, other_than
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory

@@ -3,7 +3,7 @@
 import contextlib
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -28,7 +28,6 @@ from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import ESTIMABLE, AssimilationConfig
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.steps.report import Step, merged, metrics
 from rt_torchrl.systems.operation import FIRST
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
@@ -80,20 +79,12 @@ class Assimilation:
         self.first = copy.deepcopy(self.twin.closure.state_dict())
         self.prior = WeightPrior(self.twin.closure, self.config.prior)
 
-    def update(
-        self,
-        records: Sequence[Trajectory],
-        processes: Sequence[ExogenousProcess],
-        count: int,
-        generator: torch.Generator,
-    ) -> Descended:
+    def update(self, records: Sequence[Trajectory], draw: Callable[[], Trajectory] | None = None) -> Descended:
         """Take the gradient steps of one episode.
 
         Args:
             records: the records in D_S.
-            processes: the exogenous process of each record.
-            count: number N_z of realisations of each process.
-            generator: source of the realisations.
+            draw: function that gives the records under realisations of their inputs; None for the measured inputs.
 
         Returns:
             J_p before and after, without the prior, and the descent's gradient and iterations. J_p is the mean over
@@ -101,11 +92,7 @@ class Assimilation:
             J_p before is infinite if the twin diverges on the records; the fit then begins anew from the first closure.
             Where the twin diverges under that, too, all are infinite, and the closure stays as it is.
         """
-        self._records, whole = records, batch_of(records)
-        if self.config.inputs == "realisations":
-            sampled = torch.cat([process.sample(count, generator) for process in processes])
-            rows = torch.arange(len(whole.states), device=sampled.device).repeat_interleave(count)
-            whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
+        self._records, whole = records, batch_of(records) if draw is None else draw()
         if not self.config.iterations:
             return self._descend_anew(whole)
         before, progress = copy.deepcopy(self.twin.closure.state_dict()), copy.deepcopy(self._progress())
@@ -191,7 +178,11 @@ class Assimilation:
         prior = self.prior.cost if self.prior.stiffness else lambda: replayed.states.new_zeros(())
         before = prior().item()
         if config.method == "levenberg_marquardt":
-            descended = self._least_squares(replayed)
+            likelihood = self.likelihood(replayed, prior=self.prior)
+            tolerance = NOISE_TOLERANCE if self.estimates else 1e-4
+            method = LevenbergMarquardt(likelihood.unknowns, damping=self.damping, tolerance=tolerance)
+            descended = method.run(likelihood.normal_equations, config.iterations, stop_below=config.stop_below)
+            self.damping = method.damping  # which goes on from episode to episode
         else:
             descended = self.descent.run(
                 lambda: self._identification_cost(replayed) + prior(),
@@ -201,15 +192,6 @@ class Assimilation:
         if math.isinf(descended.start):
             raise FloatingPointError("J_p of finite states overflows")
         return descended._replace(start=descended.start - before, best=descended.best - prior().item())
-
-    def _least_squares(self, replayed: Trajectory) -> Descended:
-        """Descend by Levenberg-Marquardt; the damping goes on from episode to episode."""
-        likelihood = self.likelihood(replayed, prior=self.prior)
-        tolerance = NOISE_TOLERANCE if self.estimates else 1e-4
-        method = LevenbergMarquardt(likelihood.unknowns, damping=self.damping, tolerance=tolerance)
-        descended = method.run(likelihood.normal_equations, self.config.iterations, stop_below=self.config.stop_below)
-        self.damping = method.damping
-        return descended
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         flown = self._flown(replayed)
@@ -261,7 +243,7 @@ class Assimilation:
             errors = differing.square().nanmean(0).sqrt()
         return errors
 
-    def explain(self, difference: float, generator: torch.Generator) -> bool:
+    def explain(self, difference: float) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.
 
         Returns:
@@ -321,8 +303,8 @@ class Assimilation:
 class Assimilate(Step):
     """Step 4: descend J_p over the latest records, and explain what real episodes cost other than the twin says.
 
-    Reads ``live``, ``record`` and ``large_scale``, of which the memory D_S and the processes hold more. Writes ``J_p_before`` and
-    ``J_p``, the cost of the twin on the records before and after.
+    Reads ``live``, ``record`` and ``large_scale``, of which the memory D_S and the processes hold more. Writes
+    ``J_p_before`` and ``J_p``, the cost of the twin on the records before and after.
 
     Args:
         assimilation: the fit of the twin.
@@ -351,7 +333,7 @@ class Assimilate(Step):
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         report = self.fit(list(self.short_term))
-        if self.assimilation.explain(self.belief.unexplained, self.generator):
+        if self.assimilation.explain(self.belief.unexplained):
             report.update(metrics(**self.assimilation.report()))
         # A part costs other than the episodes that the twin flies, and of the first controller it predicts nothing.
         if episode["record", "whole"] and episode["live"] != FIRST:
@@ -360,8 +342,15 @@ class Assimilate(Step):
 
     def fit(self, records: Sequence[Trajectory]) -> TensorDictBase:
         """Fit the twin to records; the report of the fit."""
-        latest, processes = self.belief.virtual.paired(records)
-        self.closure_before = copy.deepcopy(self.belief.virtual.twin.closure.state_dict())
-        fit = self.assimilation.update(latest, processes, self.realisations, self.generator)
+        (latest, processes), twin = self.belief.virtual.paired(records), self.belief.virtual.twin
+
+        def draw() -> Trajectory:
+            sampled = torch.cat([process.sample(self.realisations, self.generator) for process in processes])
+            rows = torch.arange(len(latest), device=sampled.device).repeat_interleave(self.realisations)
+            return batch_of(latest).rows(rows)._replace(exogenous=twin.plant.with_previews(sampled))
+
+        self.closure_before = copy.deepcopy(twin.closure.state_dict())
+        drawn = self.assimilation.config.inputs == "realisations"
+        fit = self.assimilation.update(latest, draw if drawn else None)
         report = metrics(J_p_before=fit.start, J_p=fit.best, closure_gradient=fit.gradient, closure_refused=0.0)
         return merged(report, metrics(**self.assimilation.report()))

@@ -8,7 +8,7 @@ import contextlib
 import copy
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -26,7 +26,6 @@ from rt_torchrl.plants.vector_field import ResidualRates
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -155,7 +154,7 @@ class Fit:
         self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
-    def update(self, records: Sequence[Trajectory], generator: torch.Generator, length: int = 0) -> float:
+    def update(self, records: Sequence[Trajectory], length: int = 0) -> float:
         """Fit the records.
 
         Where the steps have not arrived, and much more is left over than the last time, the fit also begins anew from
@@ -163,25 +162,24 @@ class Fit:
 
         Args:
             records: the records.
-            generator: source of random numbers.
             length: number of control intervals of the segments over which errors are reported; 0 for whole records.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
         first, self.whole.length = math.isinf(self.least), length
-        least, arrived = self._run(records, FIRST if first else AGAIN, generator)
+        least, arrived = self._run(records, FIRST if first else AGAIN)
         if not (first or arrived or least < FAR * self.least):
             present = copy.deepcopy(self.twin.closure.state_dict())
             self.twin.closure.load_state_dict(self._first)
-            anew, _ = self._run(records, FIRST, generator)
+            anew, _ = self._run(records, FIRST)
             if not anew < least:
                 self.twin.closure.load_state_dict(present)
             least = min(anew, least)
         self.least = least
         return least
 
-    def _run(self, records: Sequence[Trajectory], stages: int, generator: torch.Generator) -> tuple[float, bool]:
+    def _run(self, records: Sequence[Trajectory], stages: int) -> tuple[float, bool]:
         """Go through stages until the steps have arrived.
 
         Returns:
@@ -197,7 +195,7 @@ class Fit:
             safe_point()
             stages -= 1
             with contextlib.suppress(FloatingPointError):  # a twin that diverges on the way only loses the stage
-                steps = self.short.update(read_again, (), 1, generator).iterations
+                steps = self.short.update(read_again).iterations
             present = misfit(self.twin, records, self.segment)
             if present < least:
                 least, best = present, copy.deepcopy(closure.state_dict())
@@ -284,13 +282,7 @@ class EnsembleAssimilation(Assimilation):
         self.called = not hypotheses.call or set(twin.weights) != {ALONE}
         self._before: float | None = None
 
-    def update(
-        self,
-        records: Sequence[Trajectory],
-        processes: Sequence[ExogenousProcess],
-        count: int,
-        generator: torch.Generator,
-    ) -> Descended:
+    def update(self, records: Sequence[Trajectory], draw: Callable[[], Trajectory] | None = None) -> Descended:
         """As :meth:`Assimilation.update`, and fit the hypotheses if they have been called.
 
         Returns:
@@ -299,20 +291,19 @@ class EnsembleAssimilation(Assimilation):
         believed = self.fits.get(self.ensemble.likeliest)
         self._before = None if believed is None else believed.cost(records)
         if self.turns[ALONE].due() or self.always or ALONE in self.ensemble.weights:
-            descended = super().update(records, processes, count, generator)
+            descended = super().update(records, draw)
         else:
             self._records, cost = records, self.cost_of(self.in_segments(batch_of(records)))
             descended = Descended(cost, cost, math.nan, 0)
         if self.called:
-            self._weigh(generator)
+            self._weigh()
         return descended
 
-    def explain(self, difference: float, generator: torch.Generator) -> bool:
+    def explain(self, difference: float) -> bool:
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
 
         Args:
             difference: paired difference of the latest episode beyond what noise of the sensors explains.
-            generator: source of random numbers.
 
         Returns:
             Whether they have been fitted.
@@ -321,16 +312,16 @@ class EnsembleAssimilation(Assimilation):
         first = wrong and not self.called
         self.called = wrong or (self.called and set(self.ensemble.weights) != {ALONE})
         if first:
-            self._weigh(generator)
+            self._weigh()
         return first
 
-    def _weigh(self, generator: torch.Generator) -> None:
+    def _weigh(self) -> None:
         """Fit the hypotheses to the records of the last update, and weigh them."""
         records = self._records
         self.misfits = {ALONE: misfit(self.ensemble.twins[ALONE], records, self.segment)}
         for name, fit in self.fits.items():
             if self.turns[name].due():
-                self.misfits[name] = fit.update(records, generator, self.length)
+                self.misfits[name] = fit.update(records, self.length)
             else:
                 self.misfits[name] = misfit(fit.twin, records, self.segment)
         shares = evidence(self.misfits)
