@@ -79,9 +79,7 @@ def twinning(options: rt.RunConfig) -> Iterator[dict[str, float | str]]:
         learner.train_policy()
 
         # Step 3, l. 26: the process of the exogenous inputs.
-        process = ExogenousProcess.of(
-            flown["exogenous"][:, : len(inputs)], dt=plant.dt, signals=inputs, config=table.exogenous
-        )
+        process = ExogenousProcess.of(flown["exogenous"][:, : len(inputs)], signals=inputs, config=table.exogenous)
 
         # Step 4, l. 27 to 36: the twin replays the record under N_z draws of the inputs.
         z = plant.with_previews(process.sample(table.realisations, generator))

@@ -49,7 +49,7 @@ from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
 from rt_torchrl.steps.interact import Interact, Operate, RealFlights, Supervisor
 from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
-from rt_torchrl.steps.report import EpisodeReport, merged, metrics
+from rt_torchrl.steps.report import merged, metrics
 from rt_torchrl.steps.start import Start, first_live
 from rt_torchrl.steps.switch import Imitation, Referee, Switch, make_referee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
@@ -191,7 +191,7 @@ class ReinforcementTwinning(TensorDictSequential):
                 self.module[name] = step
             self.module[known] = module
 
-    def episode(self, tell: Callable[[str], None] = lambda step: None) -> EpisodeReport:
+    def episode(self, tell: Callable[[str], None] = lambda step: None) -> TensorDictBase:
         """Fly one real episode and learn from it: the steps of the arm, in their order.
 
         Args:
@@ -208,7 +208,7 @@ class ReinforcementTwinning(TensorDictSequential):
         # Numbers, texts and seconds are the report; all else is data that flows between the steps.
         keys = [key for key in flown.keys() if key != "seconds" and not isinstance(flown[key], str)]  # noqa: SIM118
         data = [key for key in keys if isinstance(flown[key], TensorDictBase) or flown[key].numel() != 1]
-        return EpisodeReport(flown.exclude("number", *data))
+        return flown.exclude("number", *data)
 
     def forward(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda step: None) -> TensorDictBase:
         """Let an episode flow through the steps, after the start before the first one; see :meth:`episode`."""

@@ -210,7 +210,7 @@ def test_corrections_are_averaged_and_those_of_like_policies_count_once():
 def test_no_correction_says_that_a_policy_is_cheaper_than_any_flight_was(monkeypatch):
     """A closed loop that falls on the twin, and not in an anchored replay, would be the cheapest of all."""
     belief, policy = belief_of([(0.5, 0.5), (1.5, 0.4)]), LinearGain([[1.0, 0.5]])
-    anchors, cheapest = belief.anchors(), min(0.0, *belief.differences())
+    anchors, cheapest = belief.anchors(), min(0.0, *(flight.d for flight in belief.compared()))
     monkeypatch.setattr(anchors.replays, "latest", lambda count: anchors.replays)
     monkeypatch.setattr(anchors.replays, "corrections", lambda policy: torch.tensor([-4.0, -5.0]).double())
     spread = (anchors.noise + anchors.growth * 4.0) ** 0.5  # actions differ by at most twice half their ranges
@@ -269,7 +269,7 @@ def test_an_episode_that_flew_costs_what_it_did_whatever_hypotheses_weigh(share)
     belief, policy = belief_of([(0.5, 0.5)], twin=twin), LinearGain([[0.5, 0.5]])
     (record,), inputs, cost = flown_on(real, policy, physics, count=1)
     replays = belief.anchors().replays
-    assert replays.corrections(policy).item() == pytest.approx(belief.differences()[0], rel=1e-9)
+    assert replays.corrections(policy).item() == pytest.approx(belief.compared()[0].d, rel=1e-9)
     said = twin.cost(policy, record.states[:1], inputs).item()
     assert said * replays.corrections(policy).exp().item() == pytest.approx(cost.item(), rel=1e-9)
 
@@ -277,7 +277,7 @@ def test_an_episode_that_flew_costs_what_it_did_whatever_hypotheses_weigh(share)
 def test_of_weights_that_flew_their_own_flights_count_and_not_those_of_their_neighbours():
     """Two episodes of one policy, which an unread force makes dearer by different factors."""
     belief = belief_of([(0.5, 0.5), (0.5, 0.5), (0.501, 0.5), (0.502, 0.5)])
-    noise, (first, second, *_) = belief.anchors().noise, belief.differences()
+    noise, (first, second, *_) = belief.anchors().noise, [flight.d for flight in belief.compared()]
     assert abs(first - second) > 0.1
     same, beside = LinearGain([[0.5, 0.5]]), LinearGain([[0.5005, 0.5]])
     assert belief.expected(same, 2.0) == pytest.approx(2.0 * math.exp(0.5 * (first + second) + 0.25 * noise))
@@ -290,7 +290,7 @@ def test_an_episode_on_which_the_twin_nearly_diverges_or_does_is_left_out(gain):
     before = belief.correction(LinearGain([[0.55, 0.5]])).item()
     wild = belief.flown[0]._replace(weights={"gain": torch.tensor([[gain, 0.0]]).double()})
     belief.append(wild.trajectory, "model_based", wild.cost, weights=wild.weights)
-    assert abs(belief.differences()[-1]) == 5.0 and len(belief.anchors().replays.starts) == 2
+    assert abs(belief.compared()[-1].d) == 5.0 and len(belief.anchors().replays.starts) == 2
     assert belief.correction(LinearGain([[0.55, 0.5]])).item() == pytest.approx(before, rel=1e-9)
 
 
@@ -311,7 +311,7 @@ def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
     (record,), _, cost = flown_on(real, LinearGain([[0.5, 0.5]]), physics, count=1)
     belief, wild = belief_of([], real, physics), LinearGain([[-1e40, 0.0]])
     belief.append(record, "model_based", cost.item(), weights=wild.state_dict())
-    assert belief.contradicted and belief.anchors() is None and belief.differences() == [5.0]
+    assert belief.contradicted and belief.anchors() is None and [flight.d for flight in belief.compared()] == [5.0]
     assert belief.expected(wild, 1.0) == pytest.approx(math.exp(5.0 + 0.5 * NOISE**2))
     assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == 1.0
 

@@ -84,12 +84,12 @@ def test_paired_differences(real, predicted, d):
 
 def test_episodes_fly_again_where_the_twin_or_they_are_new():
     found = belief_of((2.0, 0.5), (3.0, 0.7))
-    assert found.differences() == pytest.approx([0.5, 0.7]) and found.virtual.flights == 2
-    found.differences()
+    assert [flight.d for flight in found.compared()] == pytest.approx([0.5, 0.7]) and found.virtual.flights == 2
+    found.compared()
     assert found.virtual.flights == 2
     with torch.no_grad():
         found.virtual.twin.closure.matrix[0, 0] += 1e-12
-    assert found.differences() == pytest.approx([0.5, 0.7]) and found.virtual.flights == 4
+    assert [flight.d for flight in found.compared()] == pytest.approx([0.5, 0.7]) and found.virtual.flights == 4
 
 
 def test_the_latest_episodes_are_kept_and_a_saved_belief_goes_on_alike():
@@ -97,7 +97,7 @@ def test_the_latest_episodes_are_kept_and_a_saved_belief_goes_on_alike():
     assert said(found.policy_of(found.flown[0])) == pytest.approx(2.3)
     again = Belief({"model_based": LinearGain([[0.0, 0.0]])}, ByGain())
     again.load_state_dict(copy.deepcopy(found.state_dict()))
-    assert again.differences() == found.differences() and len(again.flown) == HISTORY
+    assert again.compared() == found.compared() and len(again.flown) == HISTORY
 
 
 class Profit(LinearQuadratic):

@@ -14,7 +14,7 @@ from rt_torchrl import SaturatedAffine, SaturatedMLP, StickingActuator
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.optimum import exact_optimum
-from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
@@ -58,12 +58,6 @@ def test_the_reference_of_a_plant_with_stiction_is_that_of_a_grid_and_not_of_gra
     best = min(unseen.control_costs(LinearGain([list(map(float, gains))])).mean().item() for gains in grid)
     assert found.cost == unseen.control_costs(found.policy).mean().item() <= 1.01 * best
     assert found.cost < 0.99 * found.by_gradients
-
-
-def test_a_controller_that_flies_the_real_system_alone_is_not_simulated():
-    only_real = type("OnlyReal", (RealController,), {"fly_real": None})
-    with pytest.raises(ValueError, match="law=OnlyReal can only be flown on a real system; give a ClassicalController"):
-        UnseenEpisodes(LinearQuadratic(), 2).fly(only_real(LinearQuadratic()))
 
 
 EPISODES, SEED = 8, 12345

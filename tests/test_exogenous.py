@@ -30,7 +30,7 @@ def autoregressive(n, rho, seed=0, std=1.0):
 
 def process(values, signals=FREE, **options):
     record = torch.as_tensor(values, dtype=torch.float64).reshape(len(values), -1)
-    return ExogenousProcess.of(record, dt=DT, signals=signals, config=ExogenousConfig(**options))
+    return ExogenousProcess.of(record, signals=signals, config=ExogenousConfig(**options))
 
 
 def test_samples_have_the_mean_and_covariances_of_the_model():
@@ -134,7 +134,7 @@ def test_large_scales_are_mixed_from_the_third_episode_on():
     virtual, seen = virtual_of(plant, "mixed"), []
     for level in (8.0, 11.0, 14.0):
         record = torch.full((plant.n_steps, 1), level, dtype=torch.float64)
-        virtual.processes.append(ExogenousProcess.of(record, dt=plant.dt, signals=plant.inputs, config=virtual.config))
+        virtual.processes.append(ExogenousProcess.of(record, signals=plant.inputs, config=virtual.config))
         seen.append(virtual.draw(200).exogenous[..., 0])
     assert {round(value, 6) for value in seen[1].mean(1).tolist()} == {8.0, 11.0}
     new = seen[2].mean(1)
@@ -147,9 +147,7 @@ def test_drawn_inputs_are_those_of_the_plant_whatever_was_met():
     plant = WindTurbine(horizon=60.0, observe=("preview",))
     virtual = virtual_of(plant, "drawn")
     record = torch.full((plant.n_steps, 1), 5.0, dtype=torch.float64)
-    virtual.processes.append(
-        ExogenousProcess.of(record, dt=plant.dt, signals=plant.acting_inputs, config=virtual.config)
-    )
+    virtual.processes.append(ExogenousProcess.of(record, signals=plant.acting_inputs, config=virtual.config))
     episodes, generator = virtual.draw(200), seeded()
     assert torch.equal(episodes.initial_state, plant.draw_initial_state(200, generator))
     assert torch.equal(episodes.exogenous, plant.draw_exogenous(200, generator))

@@ -1,6 +1,5 @@
 """Every argument that cannot be is refused in words, by ``data/refusals.txt``: its name, its value, what is allowed."""
 
-import dataclasses
 import importlib
 import math
 import tempfile
@@ -38,8 +37,6 @@ from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.fit.log import Column, checked, read_log
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.settings import module_of
-from rt_torchrl.steps.config import ExogenousConfig
-from rt_torchrl.steps.inputs import ExogenousProcess
 
 MODULES = """
     control.command_cost control.forecasts control.predictive_control evaluation.optimum
@@ -135,12 +132,6 @@ def ramp(duration):
 
 def horizon(**options):
     return RecedingHorizon(LQ, LQ.closure, PredictiveConfig(**options))
-
-
-def input_process(values):
-    signals = (dataclasses.replace(LQ.inputs[0]),)
-    record = torch.as_tensor(values).double().unsqueeze(-1)
-    return ExogenousProcess.of(record, dt=0.5, signals=signals, config=ExogenousConfig())
 
 
 def flight(*, policy=None, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1), spoil=None, **options):

@@ -129,16 +129,16 @@ def believed(records, *, closure=None, level=LEVELS, known=True):
 
 def test_noise_raises_no_alarm_where_it_explains_what_an_episode_cost():
     quiet, deaf, noisy = believed(4, level=0.0 * LEVELS), believed(4, known=False), believed(4)
-    assert max(map(abs, quiet.differences())) < 1e-9
+    assert max(abs(flight.d) for flight in quiet.compared()) < 1e-9
     assert deaf.examine()["alarm"] == 1.0 and deaf.contradicted  # who knows nothing of the noise
-    assert sum(map(abs, noisy.differences())) < 0.5 * sum(map(abs, deaf.differences()))
+    assert sum(abs(flight.d) for flight in noisy.compared()) < 0.5 * sum(abs(flight.d) for flight in deaf.compared())
     assert noisy.examine()["alarm"] == 0.0 and not noisy.contradicted and noisy.unexplained < 0.05
 
 
 def test_what_chance_explains_is_said():
     """The noise of an episode is other than that of the twin's flights, and here dearer by chance."""
     noisy = believed(6, level=2.0 * LEVELS)
-    assert noisy.differences()[-1] > 0.15
+    assert noisy.compared()[-1].d > 0.15
     assert "noise of the sensors explains that the episode cost" in noisy.examine()["reason"]
 
 
@@ -171,7 +171,7 @@ def test_plans_and_costs_of_policies_know_the_noise():
 def test_noise_hides_no_twin_that_is_wrong(share):
     belief = believed(4, closure=LinearClosure([[0.0, 0.0], [-0.2, 1.0]]), level=share * LEVELS)
     assert belief.examine()["alarm"] == 1.0 and belief.contradicted
-    assert belief.unexplained == pytest.approx(abs(belief.differences()[-1]), rel=0.1)
+    assert belief.unexplained == pytest.approx(abs(belief.compared()[-1].d), rel=0.1)
 
 
 class Proportional(ClassicalController):

@@ -36,26 +36,17 @@ def engine_gap(
         engine: engine to compare with ``autograd``.
 
     Returns:
-        The gap. It is infinite if the gradient is not finite where autograd's is, and NaN if autograd's is not, of
-        which no engine can be off.
+        The gap; NaN if the gradient of autograd is not finite, of which no engine can be off. That of
+        ``odeint_adjoint`` is of the order of its step, and no defect.
+
+    Raises:
+        ValueError: if the gap of an engine that should be exact is larger than rounding.
     """
     (gradient, _), (exact, cost) = (_gradient(plant, closure, policy, unseen, name) for name in (engine, "autograd"))
     if not exact.isfinite().all():
         return math.nan
     gap, scale = (gradient - exact).norm().item(), max(exact.norm().item(), NEGLIGIBLE * abs(cost))
-    if not math.isfinite(gap):
-        return math.inf
-    return gap / scale if gap else 0.0
-
-
-def require_agreement(gap: float, engine: Engine, plant: Plant) -> None:
-    """Refuse to train by an engine that should be exact, and whose gradient is another one than that of autograd.
-
-    The gap of ``odeint_adjoint`` is of the order of its step, and no defect.
-
-    Raises:
-        ValueError: if the gap is larger than rounding.
-    """
+    gap = math.inf if not math.isfinite(gap) else gap / scale if gap else 0.0
     if gap > TOLERANCE and engine != "odeint_adjoint":
         raise ValueError(
             f"engine={engine!r} gives another gradient of plant {plant.name!r} than 'autograd': over {STEPS} control "
@@ -63,6 +54,7 @@ def require_agreement(gap: float, engine: Engine, plant: Plant) -> None:
             "and policy must be functions of their arguments and weights, without memory or random numbers of their "
             "own; check_plant(plant) says what of the plant is not. Nothing was trained."
         )
+    return gap
 
 
 def _gradient(

@@ -42,11 +42,8 @@ def exact_optimum(
     make_policy: Callable[[torch.Generator], nn.Module],
     *,
     starts: int = 3,
-    iterations: int | None = None,
     few: int = 10,
-    polish: int | None = None,
-    approach: int | None = None,
-    seed: int = UNSEEN_SEED,
+    **gradients: int,
 ) -> Optimum:
     """The best policy of a class, found on the *true* plant and on the unseen episodes themselves.
 
@@ -60,18 +57,15 @@ def exact_optimum(
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
         starts: number of random initial policies.
-        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes; by default 80, or 300 where
-            weights are many.
         few: number of episodes on which every start descends.
-        polish: gradients of the best start, on all episodes; by default 20, or 150 where weights are many.
-        approach: gradients of Adam from each start before those of L-BFGS; by default none, or 600 where weights
-            are many. L-BFGS alone takes perceptrons to the next poor minimum.
-        seed: seed of the initial weights.
+        gradients: other numbers of gradients than those of ``FOR_FEW_WEIGHTS`` and ``FOR_PERCEPTRONS``: ``approach`` by
+            Adam from each start, because L-BFGS alone takes perceptrons to the next poor minimum, ``iterations`` by
+            L-BFGS after these, and ``polish`` from the best start on all episodes.
 
     Raises:
         DivergenceError: if the plant diverges under every initial policy.
     """
-    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
+    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(UNSEEN_SEED)
 
     def cost_of(policy: nn.Module, count: int | None = None) -> Callable[[], Tensor]:
         rollout, state, exogenous = unseen.rollout(policy), unseen.initial_state[:count], unseen.exogenous[:count]
@@ -88,9 +82,7 @@ def exact_optimum(
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
     trained = [weight for weight in policies[0].parameters() if weight.requires_grad]
     all_searched = len(searched(policies[0])) == len(trained)
-    usual = FOR_FEW_WEIGHTS if all_searched else FOR_PERCEPTRONS
-    requested = {"approach": approach, "iterations": iterations, "polish": polish}
-    effort = {name: usual[name] if number is None else number for name, number in requested.items()}
+    effort = (FOR_FEW_WEIGHTS if all_searched else FOR_PERCEPTRONS) | gradients
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     sound = [k for k in sorted(range(starts), key=costs.__getitem__) if math.isfinite(costs[k])]
     if not sound:

@@ -26,8 +26,6 @@ from rt_torchrl.trajectories.trajectory import (
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:  # who draws unseen episodes of a plant needs no TorchRL
-    from tensordict import TensorDictBase
-
     from rt_torchrl.plants.signal import StateBounds
     from rt_torchrl.systems.real_system import RealSystem
 
@@ -99,19 +97,7 @@ class UnseenEpisodes:
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
-        """Fly the episodes with a policy or a classical controller.
-
-        Raises:
-            ValueError: if the controller can only be flown on the real system.
-        """
-        if isinstance(policy, RealController):
-            raise ValueError(
-                f"law={type(policy).__name__} can only be flown on a real system; give a ClassicalController of plant "
-                f"{self.plant.name!r}."
-            )
-        return self._flown(policy)
-
-    def _flown(self, policy: nn.Module) -> Trajectory:
+        """Fly the episodes with a policy or a classical controller."""
         if isinstance(policy, StateFeedback):
             return policy.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
         return self.rollout(policy)(self.initial_state, self.exogenous)
@@ -222,7 +208,8 @@ class TwinEpisodes(UnseenEpisodes):
         """The plant of the believed twin, which has more states than the real system's where a hypothesis adds some."""
         return self._twin.believed.plant
 
-    def _flown(self, policy: nn.Module) -> Trajectory:
+    @torch.no_grad()
+    def fly(self, policy: nn.Module) -> Trajectory:
         """The flights on the twin; one in which the twin diverges is NaN from its first interval."""
         twin, start = self._twin.believed, self.flying.at_rest(self.initial_state)
         levels = self._twin.noise
@@ -281,50 +268,32 @@ class RealEpisodes(UnseenEpisodes):
         An episode with a reading that a safety layer refuses is flown again: its cost would be that of another reading.
 
         Raises:
-            ValueError: if the system fails or ends an episode, or several in a row have such readings.
+            ValueError: if in several episodes in a row the system fails, or has such readings.
         """
+        from rt_torchrl.steps.interact import RealFlights
+        from rt_torchrl.systems.collectors import EpisodeCollector
+
         if isinstance(policy, RealController):
             return policy.fly_real(self._count, seed=UNSEEN_SEED)
+        generator = torch.Generator(device=self.initial_state.device)
+        actor = LivePolicy(self.plant, policy, ExplorationConfig(), generator=generator)
+        rollout = EpisodeCollector(self._system, actor, self.plant).rollout
+        flights = RealFlights(self._system, actor, rollout, self.plant)
         state = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
-            flown = [self._flight(policy) for _ in range(self._count)]
+            flown = [flights.fly(policy, strength=0.0, whole=True).record for _ in range(self._count)]
         finally:
             self._system.load_state_dict(state)
-        return batch_of([self._to_the_horizon(episode) for episode in flown])
+        return batch_of([self._to_the_horizon(record) for record in flown])
 
-    def _flight(self, policy: nn.Module) -> "TensorDictBase":
-        """An episode in which all readings are right; where the system fails, the error says in which interval."""
-        from tensordict.nn import TensorDictModule
-
-        from rt_torchrl.systems.collectors import fly
-        from rt_torchrl.systems.safety import report_of
-        from rt_torchrl.systems.sound_part import FLIGHTS, sound_part, tried_in_vain
-
-        device, refused = self.initial_state.device, list[str]()
-        live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))
-        actor = TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
-        while len(refused) < FLIGHTS:
-            live.begin(policy, strength=0.0)
-            rows, why = fly(self._system, self._system.reset, lambda k, row: actor(row), self.plant)
-            if why is not None:
-                raise ValueError(why)
-            episode = torch.cat(rows)
-            sound = sound_part(episode, self.plant, report_of(self._system))
-            if sound.whole:
-                return episode
-            refused.append(sound.reason)
-        raise ValueError(tried_in_vain(refused))
-
-    def _to_the_horizon(self, episode: "TensorDictBase") -> Trajectory:
-        """The trajectory of an episode; one that ended early stays in the state in which it ended."""
-        rest = self.plant.n_steps - len(episode)
-        end, action = episode["next", "state"][-1:], episode["next", "applied"][-1:]
-        return Trajectory(
-            torch.cat([episode["state"], end.expand(rest + 1, -1)]),
-            torch.cat([episode["next", "applied"], action.expand(rest, -1)]),
-            continued(episode["exogenous"], self.plant.n_steps),
-        )
+    def _to_the_horizon(self, record: Trajectory) -> Trajectory:
+        """A record of an episode; one that ended early stays in the state in which it ended."""
+        states, actions, exogenous, *_ = record
+        rest = self.plant.n_steps - len(actions)
+        states = torch.cat([states, states[-1:].expand(rest, -1)])
+        actions = torch.cat([actions, actions[-1:].expand(rest, -1)])
+        return Trajectory(states, actions, continued(exogenous, self.plant.n_steps))
 
 
 class Judged(NamedTuple):

@@ -61,14 +61,6 @@ MOST_UNKNOWNS = 1000
 """Greatest number of first states of segments; the normal equations hold its square."""
 
 
-class Minimum(NamedTuple):
-    """A likelihood at its minimum, the number of trial steps, and the length of its segments."""
-
-    likelihood: Likelihood
-    iterations: int
-    segment: int = 0
-
-
 R = TypeVar("R")
 
 
@@ -268,10 +260,10 @@ class Estimation:
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
         if self.config.segment is None and all(r.course is not None for r in records):
-            minimum = self._longest(records)
+            likelihood, iterations, segment = self._longest(records)
         else:
-            minimum = self._minimum(records, self.config.segment or 0)
-        likelihood = minimum.likelihood
+            segment = self.config.segment or 0
+            likelihood, iterations = self._minimum(records, segment)
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
             before,
@@ -281,12 +273,14 @@ class Estimation:
             likelihood.initial().detach(),
             likelihood,
             Uncertainty(likelihood, errors=self.config.errors),
-            minimum.iterations,
-            minimum.segment,
+            iterations,
+            segment,
         )
 
-    def _minimum(self, records: Sequence[SensorRecord], length: int) -> Minimum:
+    def _minimum(self, records: Sequence[SensorRecord], length: int) -> tuple[Likelihood, int]:
         """Fit records, or segments of a length, from several first weights, with the noise levels that they leave.
+
+        It returns the likelihood at its minimum, and the number of trial steps.
 
         The first two descents begin with the present weights. The others begin with these and with the best ones so far
         in turns, moved at random: the best may have run to where nothing shows them.
@@ -319,26 +313,29 @@ class Estimation:
             iterations += self._descended(best).iterations
             if rest:
                 break
-        return Minimum(best, iterations, length)
+        return best, iterations
 
-    def _longest(self, records: Sequence[SensorRecord]) -> Minimum:
-        """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
+    def _longest(self, records: Sequence[SensorRecord]) -> tuple[Likelihood, int, int]:
+        """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones.
+
+        It returns what :meth:`_minimum` does, with the steps of all fits, and the length of the segments.
+        """
         scatter = scatter_of(self.sensors, records)
         floor = scatter.new_tensor([DEPARTURE * (sensor.noise or 0.0) for sensor in self.sensors])
         lengths, steps = [len(record.actions) for record in records], 0
         free, samples = int((self.spread > 0.0).sum()), sum(int(record.seen.sum()) for record in records)
 
-        def fit(length: int) -> tuple[Minimum, Tensor]:
+        def fit(length: int) -> tuple[tuple[Likelihood, int], Tensor]:
             nonlocal steps
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
-            minimum = self._minimum(records, length)
-            steps += minimum.iterations
-            return minimum, judged(minimum.likelihood).rms
+            likelihood, iterations = self._minimum(records, length)
+            steps += iterations
+            return (likelihood, length), judged(likelihood).rms
 
         enough = torch.maximum(EXPLAINED * scatter, floor)
-        minimum = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
-        return minimum._replace(iterations=steps)
+        best, length = over_segments(self.twin.closure, max(lengths), fit, enough, lambda: self.unstable(records))
+        return best, steps, length
 
     def unstable(self, records: Sequence[SensorRecord]) -> bool:
         """Whether an error grows by more than a factor of 1000 along a record.

@@ -73,18 +73,12 @@ class Column(NamedTuple):
             ValueError: if the text has another form, or the factor is zero.
         """
         match = COLUMN.fullmatch(text.strip())
-        if match is None or not float(match["factor"] or 1.0):
+        if match is None or not (factor := float(match["factor"] or 1.0)):
             raise ValueError(
                 f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
                 "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
             )
-        return cls(
-            match["header"],
-            match["signal"],
-            float(match["factor"] or 1.0),
-            float(match["offset"] or 0.0),
-            match["unit"],
-        )
+        return cls(match["header"], match["signal"], factor, float(match["offset"] or 0.0), match["unit"])
 
 
 @dataclass(frozen=True, kw_only=True)

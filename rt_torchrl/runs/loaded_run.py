@@ -196,7 +196,7 @@ class LoadedRun:
             from rt_torchrl.steps.inputs import ExogenousProcess  # here, because it loads TorchRL
 
             signals, given = self.physics.acting_inputs, self.config.twinning.exogenous
-            process = ExogenousProcess.of(inputs[:, : len(signals)], dt=self.physics.dt, signals=signals, config=given)
+            process = ExogenousProcess.of(inputs[:, : len(signals)], signals=signals, config=given)
         return Snapshot(
             plant=self.physics,
             true_closure=None if self._only_on_the_twin else self.plant.closure,

@@ -85,6 +85,20 @@ class Flown(NamedTuple):
     deviation: Tensor | None = None
 
 
+class Compared(NamedTuple):
+    """A real episode beside the same one on the present twin; not numbers where state feedback flew it.
+
+    Attributes:
+        predicted: J_a that the twin says; infinite where it diverges.
+        d: the paired difference.
+        beyond_noise: the paired difference beyond what other noise of the sensors explains of a large one.
+    """
+
+    predicted: float
+    d: float
+    beyond_noise: float
+
+
 class Judged(NamedTuple):
     """What a policy costs; the smaller one is the better one.
 
@@ -129,7 +143,7 @@ class Belief:
         self.first: list[Flown] = []
         """The latest episodes of the controller that flew first."""
         self._state: dict[str, Any] | None = None
-        self._results: dict[str | int, Any] = {}
+        self._results: dict[str, Any] = {}
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
         virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
@@ -171,7 +185,7 @@ class Belief:
         self.flown = [*self.flown, flown][-HISTORY:]
         self._state = None
 
-    def _kept(self, name: str | int, compute: Callable[[], Any]) -> Any:
+    def _kept(self, name: str, compute: Callable[[], Any]) -> Any:
         """What is computed of the present twin and the episodes, once until one of both changes."""
         state = self.virtual.twin.state_dict() | {"noise": self.virtual.twin.noise}
         if self._state is None or not equal(state, self._state):
@@ -233,35 +247,20 @@ class Belief:
         policy.load_state_dict(flown.weights)
         return policy
 
-    @torch.no_grad()
-    def differences(self) -> list[float]:
-        """The paired differences of the episodes on the present twin, which flies them again only if it has changed.
+    def compared(self) -> list[Compared]:
+        """The episodes beside those on the present twin, which flies them again only if it has changed."""
+        compared: list[Compared] = self._kept("flights", lambda: [self._flown_again(flown) for flown in self.flown])
+        return compared
 
-        Episodes of state feedback count as none, with NaN: its flights on the twin take too long.
-        """
-        pairs = zip(self.flown, self._predicted(), strict=True)
-        return [math.nan if math.isnan(predicted) else difference(flown.cost, predicted) for flown, predicted in pairs]
-
-    def _predicted(self) -> list[float]:
-        """J_a that the present twin says of each episode; infinite where it diverges, NaN of state feedback."""
-        costs: list[float] = self._kept("costs", lambda: [self._flown_again(flown) for flown in self.flown])
-        return costs
-
-    def _flown_again(self, flown: Flown) -> float:
+    def _flown_again(self, flown: Flown) -> Compared:
         policy, episode = self.policy_of(flown), self.virtual.repeated(flown.trajectory)
-        if isinstance(policy, StateFeedback):
-            return math.nan
-        return self.virtual.cost(policy, episode, explored(flown, episode))
-
-    def _beyond_noise(self, k: int, d: float) -> float:
-        """The paired difference d of an episode beyond what other noise of the sensors explains of a large one.
-
-        Noise excuses no fall: the greatest difference that counts stays as it is.
-        """
-        if not NOISE < abs(d) < DEARER:
-            return d
-        least, greatest = self._kept(k, lambda: self._explained_by_noise(self.flown[k]))
-        return d - min(max(d, least), greatest)
+        if isinstance(policy, StateFeedback):  # its flights on the twin take too long
+            return Compared(math.nan, math.nan, math.nan)
+        predicted = self.virtual.cost(policy, episode, explored(flown, episode))
+        d, least, greatest = difference(flown.cost, predicted), 0.0, 0.0
+        if NOISE < abs(d) < DEARER:  # noise excuses no fall
+            least, greatest = self._explained_by_noise(flown)
+        return Compared(predicted, d, d - min(max(d, least), greatest))
 
     @torch.no_grad()
     def _explained_by_noise(self, flown: Flown) -> tuple[float, float]:
@@ -295,15 +294,14 @@ class Belief:
             ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1, or a
             ``reason`` if noise of the sensors explains it. Nothing if state feedback flew it.
         """
-        differences = self.differences()
-        if not differences or math.isnan(differences[-1]):
+        known = [flight for flight in self.compared() if not math.isnan(flight.d)]
+        if not known or known[-1] is not self.compared()[-1]:
             return metrics()
-        known = [(k, d) for k, d in enumerate(differences) if not math.isnan(d)]
-        beyond_noise = [self._beyond_noise(k, d) for k, d in known[-2:]]
-        warning, hypothesis = alarm(beyond_noise), self.virtual.twin.hypothesis
-        report = metrics(paired_difference=differences[-1], alarm=float(warning is not None))
-        if abs(differences[-1]) > ALARM and beyond_noise[-1] == 0.0:
-            cost = f"{math.exp(differences[-1]):.3g} times what the twin says of it"
+        _, d, beyond_noise = known[-1]
+        warning, hypothesis = alarm([flight.beyond_noise for flight in known]), self.virtual.twin.hypothesis
+        report = metrics(paired_difference=d, alarm=float(warning is not None))
+        if abs(d) > ALARM and beyond_noise == 0.0:
+            cost = f"{math.exp(d):.3g} times what the twin says of it"
             report.set_non_tensor("reason", f"noise of the sensors explains that the episode cost {cost}")
         if warning is None:
             return report
@@ -314,11 +312,9 @@ class Belief:
 
     @property
     def unexplained(self) -> float:
-        """Size of the last paired difference beyond what noise of the sensors explains."""
-        differences = self.differences()
-        if not differences or math.isnan(differences[-1]):
-            return 0.0
-        return abs(self._beyond_noise(len(differences) - 1, differences[-1]))
+        """Size of the last paired difference beyond what noise of the sensors explains; 0 where there is none."""
+        last = self.compared()[-1:]
+        return abs(last[0].beyond_noise) if last and not math.isnan(last[0].d) else 0.0
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory], n: int) -> float:
@@ -349,8 +345,8 @@ class Belief:
         if not self.corrects or not 0.0 < cost < math.inf:
             return cost
         weights = {name: weight.clone() for name, weight in policy.state_dict().items()}
-        pairs = zip(self.differences(), self.flown, strict=True)
-        flown = [d for d, flight in pairs if equal(flight.weights, weights)]
+        pairs = zip(self.compared(), self.flown, strict=True)
+        flown = [again.d for again, flight in pairs if equal(flight.weights, weights)]
         try:
             if self.contradicted and flown and not any(map(math.isnan, flown)):
                 anchors = self.anchors()
@@ -385,7 +381,7 @@ class Belief:
     @property
     def contradicted(self) -> bool:
         """Whether an episode cost other than the present twin says, beyond what noise of the sensors explains."""
-        return any(abs(self._beyond_noise(k, d)) > NOISE for k, d in enumerate(self.differences()))
+        return any(abs(flight.beyond_noise) > NOISE for flight in self.compared())
 
     def anchors(self) -> "Anchors | None":
         """The latest whole episodes that the present twin flies; None without any, and while the twin is right."""
@@ -397,7 +393,7 @@ class Belief:
         if not self.contradicted:
             return None
         known = list[tuple[Flown, Tensor, float]]()
-        for flown, predicted, d in zip(self.flown, self._predicted(), self.differences(), strict=True):
+        for flown, (predicted, d, _) in zip(self.flown, self.compared(), strict=True):
             exogenous = self.virtual.repeated(flown.trajectory).exogenous
             # State feedback is no function of an observation, a part of an episode has another cost, and where the
             # twin diverges, or nearly does, nothing is near.
@@ -483,7 +479,7 @@ class Belief:
         if not self.flown:
             return
         twin, last = self.virtual.twin, self.flown[-1]
-        again, elsewhere = self._predicted()[-1], self.virtual.cost(self.policy_of(last), episodes)
+        again, elsewhere = self.compared()[-1].predicted, self.virtual.cost(self.policy_of(last), episodes)
         pairs = [(last.cost, again), (max(flown.cost for flown in self.flown), elsewhere)]
         if any(math.isinf(predicted) or difference(real, predicted) <= -DEARER for real, predicted in pairs):
             raise DivergenceError(

@@ -58,16 +58,9 @@ class ExogenousProcess:
 
     @classmethod
     def of(
-        cls, record: Float[Tensor, "n n_z"], *, dt: float, signals: Sequence[Signal], config: ExogenousConfig
+        cls, record: Float[Tensor, "n n_z"], *, signals: Sequence[Signal], config: ExogenousConfig
     ) -> "ExogenousProcess":
-        """The process of a record of the input at every control interval ``dt`` [s].
-
-        Raises:
-            ValueError: if the record holds NaN, or fewer samples than a regression needs.
-        """
-        if not record.isfinite().all():
-            k = (~record.isfinite().all(-1)).nonzero()[0].item()
-            raise ValueError(f"record of the exogenous input is not finite at sample {k}, t = {k * dt:g} s; repair it.")
+        """The process of a record of the input at every control interval."""
         like = partial(torch.as_tensor, dtype=record.dtype, device=record.device)
         # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
@@ -331,7 +324,7 @@ class VirtualEpisodes:
     def _process(self, record: Trajectory) -> ExogenousProcess:
         signals = self.twin.plant.acting_inputs
         acted = record.exogenous[:, : len(signals)]
-        return ExogenousProcess.of(acted, dt=self.twin.plant.dt, signals=signals, config=self.config)
+        return ExogenousProcess.of(acted, signals=signals, config=self.config)
 
     def draw(self, count: int, *, recorded: bool = False) -> Scenario:
         """Draw initial states, and exogenous inputs from the processes that are kept or as the plant draws them.

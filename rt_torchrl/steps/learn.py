@@ -694,17 +694,8 @@ class LeastPriorityWriter(RoundRobinWriter):
         """Priority of the transition in each place; of equal ones the first goes first."""
 
     def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
-        """Write transitions in their places, which are returned.
-
-        Raises:
-            ValueError: if there are more transitions than places.
-        """
+        """Write transitions, of which there are no more than places, and return their places."""
         stored, capacity, n = len(self._storage), len(self.priorities), len(data)
-        if n > capacity:
-            raise ValueError(
-                f"{n} transitions at once do not fit a long-term memory of {capacity}; raise capacity to at least one "
-                "episode."
-            )
         free = np.arange(stored, min(stored + n, capacity))
         evicted = self.priorities[:stored].argsort(kind="stable")[: n - len(free)]
         index = torch.from_numpy(np.concatenate([free, evicted]))

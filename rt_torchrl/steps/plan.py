@@ -129,15 +129,11 @@ class RecedingHorizonPlanner:
         policy: the controller, which acts in the place of π_mb.
         config: parameters of step 5.
 
-    Raises:
-        ValueError: if the controller plans on another closure than the twin's.
     """
 
     policy: nn.Module
 
     def __init__(self, twin: DigitalTwin, policy: PredictiveControl, config: PlannerConfig):
-        if policy.closure is not twin.closure:
-            raise ValueError("the controller plans on another closure than the twin's; build it with twin.closure.")
         self.twin, self.policy, self.config, self._learn = twin, policy, config, policy.learn
 
     def plan(self, episodes: Scenario) -> Descended:
@@ -167,10 +163,11 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig) ->
         config: parameters of step 5.
 
     Raises:
-        ValueError: if the method is receding_horizon and the policy is not :class:`PredictiveControl`, or the other way
-            round.
+        ValueError: if the method is receding_horizon and the policy is not :class:`PredictiveControl` on the closure of
+            the twin, or the other way round.
     """
-    if isinstance(policy, PredictiveControl) != (config.method == "receding_horizon"):
+    other = isinstance(policy, PredictiveControl) and policy.closure is not twin.closure
+    if other or isinstance(policy, PredictiveControl) != (config.method == "receding_horizon"):
         raise ValueError(
             f"method={config.method!r} of the planning does not go with a policy of class {type(policy).__name__}: "
             "receding_horizon needs model_based=PredictiveControl(twin.plant, twin.closure, ...), and it alone."

@@ -81,23 +81,6 @@ def in_words(cost: float, digits: int = 3) -> str:
     return f"{cost:.{digits}g}" if math.isfinite(cost) else "diverges"
 
 
-class EpisodeReport(TensorDict):
-    """The report of a whole episode; printed, it is a few lines about costs, the live policy and the event."""
-
-    def __repr__(self) -> str:
-        real = f"J_a {self['real_cost']:.4g}" if "real_cost" in self else "no real episode"
-        lines = [f"real episode: {real}" + (f", flown by {self['live']}" if "live" in self else "")]
-        if "J_p" in self:
-            after, before = (in_words(float(self[key]), 4) for key in ("J_p", "J_p_before"))
-            believed = f" with {self['believed']!r}" if "believed" in self else ""
-            lines.append(f"twin{believed}: J_p {after}, {before} before assimilation")
-        judged = [key for key in ("J_a_model_based", "J_a_model_free") if key in self]
-        costs = [f"{key[4:]} {in_words(float(self[key]), 4)}" for key in judged]
-        lines += [f"J_a on the twin: {', '.join(costs)}"] if costs else []
-        lines += [f"{key}: {self[key]}" for key in ("event", "warning", "reason", "refusal") if key in self]
-        return "\n".join(lines)
-
-
 def weight_change(module: nn.Module, earlier: Tensor) -> Tensor:
     """The relative change ‖w − w_earlier‖/‖w‖ of a module's weights since they were the vector ``earlier``."""
     now = parameters_to_vector(module.parameters()).detach()

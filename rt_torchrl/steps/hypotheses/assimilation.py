@@ -138,16 +138,9 @@ class Fit:
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig, segment: int):
         self.twin, self.segment = twin, segment
-        measured = dataclasses.replace(config, inputs="record", segment=config.segment or 0)
-        short = dataclasses.replace(
-            measured,
-            method="levenberg_marquardt",
-            initial="measured",
-            segment=0,
-            stop_below=0.0,
-            iterations=STEPS,
-        )
+        short = AssimilationConfig(iterations=STEPS, prior=config.prior, segment=0, initial="measured")
         self.short = Assimilation(twin.of(Reread(twin.plant)), short)
+        measured = dataclasses.replace(config, inputs="record", segment=config.segment or 0)
         self.whole = Assimilation(twin, measured)
         """What tells the errors over records, which is not fitted."""
         self.least = math.inf
@@ -327,7 +320,8 @@ class EnsembleAssimilation(Assimilation):
         shares = evidence(self.misfits)
         for name, turns in self.turns.items():
             turns.rest(hopeless=shares[name] < HOPELESS)
-        self.ensemble.weights = {name: share for name, share in shares.items() if share >= LEAST}
+        kept = {name: share for name, share in shares.items() if share >= LEAST}
+        self.ensemble.weights = {name: share / sum(kept.values()) for name, share in kept.items()}
 
     def report(self) -> dict[str, float | str]:
         """The weight and the misfit of every hypothesis, and what is said of the twin where a hypothesis is believed.
@@ -358,7 +352,7 @@ class EnsembleAssimilation(Assimilation):
         return super().state_dict() | {
             "fits": {name: fit.state_dict() for name, fit in self.fits.items()},
             "misfits": dict(self.misfits),
-            "weights": self.ensemble.weights,
+            "weights": dict(self.ensemble.weights),
             "called": self.called,
             "turns": {name: dataclasses.asdict(turns) for name, turns in self.turns.items()},
         }
@@ -367,7 +361,7 @@ class EnsembleAssimilation(Assimilation):
         super().load_state_dict(state)
         for name, fit in self.fits.items():
             fit.load_state_dict(state["fits"][name])
-        self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
+        self.misfits, self.ensemble.weights = dict(state["misfits"]), dict(state["weights"])
         self.called = state["called"]
         self.turns = {name: Turns(**saved) for name, saved in state["turns"].items()}
 

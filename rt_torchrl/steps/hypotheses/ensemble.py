@@ -1,7 +1,6 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
 import copy
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -62,23 +61,13 @@ class TwinEnsemble(DigitalTwin):
         self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine)}
         for name, suspect in suspects.items():
             self.twins[name] = DigitalTwin(suspect, closures[name], engine=able(engine, suspect))
-        self.weights = {ALONE: 1.0}
-
-    @property
-    def weights(self) -> dict[str, float]:
+        self.weights: dict[str, float] = {ALONE: 1.0}
         """Weights of the hypotheses that are planned on; they sum to one."""
-        return dict(self._shares)
-
-    @weights.setter
-    def weights(self, shares: Mapping[str, float]) -> None:
-        total = sum(shares.values())
-        total = 1.0 if math.isclose(total, 1.0) else total  # shares that were saved stay the same to the bit
-        self._shares = {name: share / total for name, share in shares.items()}
 
     @property
     def likeliest(self) -> str:
         """Name of the hypothesis with the greatest weight."""
-        return max(self._shares, key=self._shares.__getitem__)
+        return max(self.weights, key=self.weights.__getitem__)
 
     @property
     def believed(self) -> DigitalTwin:
@@ -101,7 +90,7 @@ class TwinEnsemble(DigitalTwin):
     def state_dict(self) -> dict[str, Any]:
         """As :meth:`DigitalTwin.state_dict`, and ``hypotheses``: their closures, and the weights of all that count."""
         closures = {name: twin.closure.state_dict() for name, twin in self.twins.items() if name != ALONE}
-        return super().state_dict() | {"hypotheses": {"closures": closures, "weights": self.weights}}
+        return super().state_dict() | {"hypotheses": {"closures": closures, "weights": dict(self.weights)}}
 
     def load_hypotheses(self, state: Mapping[str, Any]) -> None:
         """Take the closures of the hypotheses and their weights, as ``hypotheses`` of :meth:`state_dict` holds them.
@@ -120,7 +109,7 @@ class TwinEnsemble(DigitalTwin):
                 self.twins[name].closure.load_state_dict(closures[name])
             except RuntimeError as error:
                 raise ValueError(f"closure of hypothesis {name!r} does not fit: {error}") from error
-        self.weights = state["weights"]
+        self.weights = dict(state["weights"])
 
     def retreat(self) -> None:
         """Leave every hypothesis out for this episode: the policy that has just flown diverges under one."""
@@ -142,12 +131,12 @@ class TwinEnsemble(DigitalTwin):
         State feedback plans on the twin alone, and is flown under every hypothesis as a policy is, so that the costs of
         both can be compared.
         """
-        twins = [self.twins[name] for name in self._shares]
+        twins = [self.twins[name] for name in self.weights]
         for twin in twins:
             twin.noise = self.noise
         flights = ((twin, twin.plant.at_rest(initial_state)) for twin in twins)
         costs = [twin.episode_costs(policy, start, exogenous, deviation) for twin, start in flights]
-        return initial_state.new_tensor(list(self._shares.values())) @ torch.stack(costs)
+        return initial_state.new_tensor(list(self.weights.values())) @ torch.stack(costs)
 
 
 def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, engine: Engine = "native") -> DigitalTwin:
