@@ -68,7 +68,7 @@ from .steps.config import (
 )
 from .steps.hypotheses.ensemble import TwinEnsemble
 from .steps.plan import Planner, RecedingHorizonPlanner, WholeEpisodes
-from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
+from .steps.switch import DecisionTree, Evidence, Referee
 from .steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
@@ -115,7 +115,6 @@ __all__ = [
     "EstimationConfig",
     "Evidence",
     "ExogenousConfig",
-    "ExpectedCost",
     "ExplorationConfig",
     "ExtendedClosure",
     "Extension",

@@ -51,7 +51,7 @@ from rt_torchrl.steps.learn import ActorCritic, Learn, Learner
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
 from rt_torchrl.steps.report import merged, metrics
 from rt_torchrl.steps.start import Start, first_live
-from rt_torchrl.steps.switch import Imitation, Referee, Switch, make_referee
+from rt_torchrl.steps.switch import DecisionTree, Imitation, Referee, Switch
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation, system_of
@@ -127,7 +127,7 @@ class ReinforcementTwinning(TensorDictSequential):
             config = dataclasses.replace(config, exploration=config.exploration.imitating())
         learner = learner or ActorCritic(twin.plant, model_free, config.learner, generator=generator)
         planner = planner or make_planner(twin, model_based, config.planner)
-        referee = referee or make_referee(config.referee, first_live(config.arm, first))
+        referee = referee or DecisionTree(config.referee, first_live(config.arm, first))
         halves: dict[Role, Learner | Planner] = {"model_free": learner, "model_based": planner}
         for role, half in halves.items():
             if half.policy is not policies[role]:
@@ -157,7 +157,7 @@ class ReinforcementTwinning(TensorDictSequential):
             "interact": interact,
             "learn": Learn(learner, belief, judged),
             "inputs": FitInputs(virtual),
-            "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations, generator),
+            "assimilate": Assimilate(assimilation, belief, interact.short_term, config.realisations),
             "plan": MultiStart(planner, belief, config.planner, counts, make_policy),
             "switch": Switch(referee, Imitation(belief, judged), learner, planner),
         }

@@ -16,7 +16,7 @@ from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.learn import Learn
 from rt_torchrl.steps.report import metrics
-from rt_torchrl.steps.switch import DecisionTree, Evidence, ExpectedCost, Imitation
+from rt_torchrl.steps.switch import DecisionTree, Evidence, Imitation
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
 
@@ -179,7 +179,7 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
 
 
 def test_the_cheaper_policy_acts():
-    referee = ExpectedCost(RefereeConfig(clone_patience=0), "model_free")
+    referee = DecisionTree(RefereeConfig(clone_patience=0), "model_free")
 
     def decided(live, idle, change=1.0):
         return referee.decide(Evidence(live, idle, change)), referee.live
@@ -260,6 +260,6 @@ SWAP, CLONE = [*["keep"] * 2, "swap"], [*["keep"] * 3, "clone"]
     ],
 )
 def test_every_branch(script, expected):
-    referee = DecisionTree(RefereeConfig(), live="model_free")
+    referee = DecisionTree(RefereeConfig(rule="decision_tree"), live="model_free")
     assert [referee.decide(Evidence(*evidence)) for evidence in script] == expected
     assert referee.live == ("model_based" if expected.count("swap") == 1 else "model_free")

@@ -13,7 +13,7 @@ from test_algorithm import flown, twinning, weights
 from rt_torchrl import DigitalTwin, Planner, PlantEnv, ReinforcementTwinning, WholeEpisodes
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
-from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee
+from rt_torchrl.steps.switch import DecisionTree, Referee
 
 PLANT = LinearQuadratic(horizon=2.0)
 SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}
@@ -32,8 +32,8 @@ PLANNERS = {
     "documented": lambda twin, policy: documented("planner.md", "Steps")(twin, policy),
 }
 REFEREES = {
-    "decision tree": lambda: DecisionTree(RefereeConfig(patience=0)),
-    "expected cost": lambda: ExpectedCost(RefereeConfig()),
+    "decision tree": lambda: DecisionTree(RefereeConfig(rule="decision_tree", patience=0)),
+    "expected cost": lambda: DecisionTree(RefereeConfig()),
     "documented": lambda: documented("referee.md", "ModelFirst")(),
 }
 

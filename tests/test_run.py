@@ -17,7 +17,7 @@ import rt_torchrl as rt
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
 from rt_torchrl.steps.plan import MultiStart, make_planner
-from rt_torchrl.steps.switch import clones, make_referee
+from rt_torchrl.steps.switch import DecisionTree, clones
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
@@ -169,7 +169,7 @@ def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
     parts = {
         "learner": partial(ActorCritic, replay=noted("replay", LongTermMemory)),
         "planner": make_planner,
-        "referee": make_referee,
+        "referee": DecisionTree,
         "collector": plain_collector,
     }
     usual = run("usual")

@@ -13,6 +13,7 @@ are then cut into segments with first states of their own (multiple shooting), w
 
 import contextlib
 import copy
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
@@ -21,13 +22,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.likelihood import Likelihood, Offsets, WeightPrior
-from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments, state_places
+from rt_torchrl.fit.likelihood import Likelihood, WeightPrior, first_noise, scatter_of
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import AtLeastOne, Count, NotNegative, configuration
-from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -39,8 +39,6 @@ INITIAL_ITERATIONS = 20
 """Number of trial steps for initial states alone; it is small because J is nearly quadratic in them."""
 SETTLED = 0.01
 """Relative change of the noise levels below which they rest."""
-FIRST_NOISE = 0.1
-"""First guess of an unknown noise level, as a share of the scatter of the readings."""
 LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
 EXPLAINED = 0.5
@@ -249,6 +247,7 @@ class Estimation:
                 f"spread={self.spread.tolist()} of the initial states must hold one number for each of {names}: 0 for "
                 "a state that is known, or inf."
             )
+        self.likelihood = functools.partial(Likelihood, twin, self.sensors, self.spread)
 
     def run(self, records: Sequence[SensorRecord]) -> Estimate:
         """Estimate all unknowns from the records.
@@ -350,8 +349,8 @@ class Estimation:
             likelihood = free.likelihood(parts, noise, weights=False, biases=torch.zeros_like(noise))
             size, ends = likelihood.initial.unit.sum(-1), dict[int, Tensor]()
             try:
-                for group, _, sensitivity in likelihood.replays():
-                    ends.update(zip(group.numbers, sensitivity[:, -1] / size[:, None], strict=True))
+                for group in likelihood.groups:
+                    ends.update(zip(group.numbers, likelihood.replay(group)[1][:, -1] / size[:, None], strict=True))
             except DivergenceError:
                 return True
             growth = torch.eye(len(size), dtype=size.dtype, device=size.device)
@@ -360,47 +359,6 @@ class Estimation:
                 if not growth.abs().max() < GROWTH:
                     return True
         return False
-
-    def likelihood(
-        self,
-        records: Sequence[SensorRecord],
-        noise: Float[Tensor, " n_y"] | None = None,
-        *,
-        prior: WeightPrior | None = None,
-        weights: bool = True,
-        known: bool = False,
-        biases: Float[Tensor, " n_y"] | None = None,
-    ) -> Likelihood:
-        """The likelihood of records, with initial states at their guess.
-
-        Args:
-            records: the records.
-            noise: noise levels; by default those that are given, and a share of the readings' scatter for others.
-            prior: prior of the weights.
-            weights: whether the weights are unknowns.
-            known: whether to take the initial states as known, and biases as zero.
-            biases: known biases; None lets those that are wanted be unknowns.
-        """
-        noise = first_noise(self.sensors, records) if noise is None else noise
-        first = torch.stack([record.guess for record in records])
-        free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
-        sizes = usual_sizes(self.twin.plant, first, self.sensors, records) if free else torch.ones_like(first[0])
-        unknown = biases is None and not known
-        biased = [k for k, sensor in enumerate(self.sensors) if sensor.bias and unknown]
-        # A bias may be far more than noise and scatter, and a step changes it by a unit at most.
-        largest = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
-        unit = torch.maximum(noise, FIRST_NOISE * largest)
-        return Likelihood(
-            self.twin,
-            records,
-            self.sensors,
-            Offsets(first, free, sizes),
-            noise,
-            spread=self.spread.to(first.device),
-            biases=Offsets(torch.zeros_like(noise) if biases is None else biases, biased, unit),
-            prior=prior,
-            weights=weights,
-        )
 
     def fit_initial_states(
         self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"], biases: Float[Tensor, " n_y"] | None = None
@@ -440,59 +398,6 @@ class Estimation:
         rest = bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
         likelihood.noise = levels
         return rest
-
-
-def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """RMS difference of each sensor's readings from its first one.
-
-    Raises:
-        ValueError: if there is no record, or a sensor has no sample.
-    """
-    if not records:
-        raise ValueError("records=[] of the estimation must hold at least one record.")
-    readings = torch.cat([record.readings for record in records])
-    scatter = []
-    for sensor, values in zip(sensors, readings.T, strict=True):
-        samples = values[~values.isnan()]
-        if not len(samples):
-            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
-        origin = samples[:1].expand_as(samples)
-        change = differences([sensor.measurement], samples[:, None], origin[:, None])
-        scatter.append(change.square().mean().sqrt())
-    return torch.stack(scatter)
-
-
-def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """Noise levels that are given; for others a share of the scatter of the readings.
-
-    Raises:
-        ValueError: if there is no record, or a sensor has no sample.
-    """
-    scatter, levels = scatter_of(sensors, records), []
-    size = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
-    for sensor, change, largest in zip(sensors, scatter.tolist(), size.tolist(), strict=True):
-        guess = FIRST_NOISE * change or 1e-6 * max(largest, 1.0)
-        levels.append(guess if sensor.noise is None else sensor.noise)
-    return scatter.new_tensor(levels)
-
-
-def usual_sizes(
-    plant: Plant, first: Float[Tensor, "records n_s"], sensors: Sequence[Sensor], records: Sequence[SensorRecord]
-) -> Float[Tensor, " n_s"]:
-    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it.
-
-    It is the greatest of the scatter of the states that the plant draws, that of what a sensor reads of it, and a tenth
-    of the guess.
-    """
-    drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
-    sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
-    for column, k in enumerate(state_places(plant, sensors)):
-        if k is not None:
-            values = torch.cat([record.readings[:, column] for record in records])
-            values = values[~values.isnan()]
-            scatter = (values - values.mean()).square().mean().sqrt()
-            sizes[k] = torch.fmax(sizes[k], scatter)  # of a sensor without samples there is none
-    return torch.where(sizes > 0.0, sizes, 1.0)
 
 
 class Judgement(NamedTuple):

@@ -27,6 +27,8 @@ from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+FIRST_NOISE = 0.1
+"""First guess of an unknown noise level, as a share of the scatter of the readings."""
 REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
 
 
@@ -110,37 +112,49 @@ class Likelihood:
 
     Args:
         twin: the twin; the trainable weights of its closure come first among the unknowns.
-        records: what the sensors read, in records of any lengths.
         sensors: the sensors of all records.
-        initial: initial states of the records; their offsets come next.
-        noise: standard deviation σ of each sensor.
-        spread: standard deviation ρ of the initial states about their guess; infinite where nothing is known.
-        biases: offsets of the sensors, which come last.
+        spread: standard deviation ρ of the initial states about their guess; infinite where nothing is known. Offsets
+            of the initial states come next among the unknowns.
+        records: what the sensors read, in records of any lengths.
+        noise: standard deviation σ of each sensor; by default those that are given, and a share of the readings'
+            scatter for others.
         prior: prior of the closure's weights; None for none.
         weights: whether the closure's weights are unknowns.
+        known: whether to take the initial states as known, and biases as zero.
+        biases: known biases; None lets those that are wanted be unknowns, which come last.
     """
 
     def __init__(
         self,
         twin: DigitalTwin,
-        records: Sequence[SensorRecord],
         sensors: Sequence[Sensor],
-        initial: Offsets,
-        noise: Float[Tensor, " n_y"],
-        *,
         spread: Float[Tensor, " n_s"],
-        biases: Offsets,
-        prior: WeightPrior | None,
-        weights: bool,
+        records: Sequence[SensorRecord],
+        noise: Float[Tensor, " n_y"] | None = None,
+        *,
+        prior: WeightPrior | None = None,
+        weights: bool = True,
+        known: bool = False,
+        biases: Float[Tensor, " n_y"] | None = None,
     ):
-        self.twin, self.records, self.sensors = twin, list(records), tuple(sensors)
-        self.initial, self.noise, self.spread, self.biases, self.prior = initial, noise, spread, biases, prior
+        noise = first_noise(sensors, records) if noise is None else noise
+        first = torch.stack([record.guess for record in records])
+        free = [] if known else (spread > 0.0).nonzero().flatten().tolist()
+        sizes = usual_sizes(twin.plant, first, sensors, records) if free else torch.ones_like(first[0])
+        biased = [k for k, sensor in enumerate(sensors) if sensor.bias and biases is None and not known]
+        # A bias may be far more than noise and scatter, and a step changes it by a unit at most.
+        largest = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
+        unit = torch.maximum(noise, FIRST_NOISE * largest)
+        self.plant: Plant = twin.plant
+        self.twin, self.records, self.sensors, self.prior = twin, list(records), tuple(sensors), prior
+        self.initial, self.noise, self.spread = Offsets(first, free, sizes), noise, spread.to(first.device)
+        self.biases = Offsets(torch.zeros_like(noise) if biases is None else biases, biased, unit)
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._unknown_weights = self.weight_count if weights else 0
-        self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
+        self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), self.initial, self.biases])
         self._states = state_places(twin.plant, self.sensors)
         lengths = [len(record.actions) for record in records]
-        self._groups = [
+        self.groups = [
             self._group([i for i, n in enumerate(lengths) if n == length]) for length in dict.fromkeys(lengths)
         ]
 
@@ -162,10 +176,6 @@ class Likelihood:
         return torch.cat([torch.arange(*ends, device=self.noise.device) for ends in ranges])
 
     @property
-    def plant(self) -> Plant:
-        return self.twin.plant
-
-    @property
     def count(self) -> int:
         """Number of unknowns."""
         return self._unknown_weights + self.initial.offsets.numel() + self.biases.offsets.numel()
@@ -173,7 +183,7 @@ class Likelihood:
     @property
     def samples(self) -> Int[Tensor, " n_y"]:
         """Number of samples of each sensor."""
-        return torch.stack([group.seen.sum((0, 1)) for group in self._groups]).sum(0)
+        return torch.stack([group.seen.sum((0, 1)) for group in self.groups]).sum(0)
 
     def _priors(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The stiffness of every unknown about the value at which a prior holds it, and its distance from there."""
@@ -188,15 +198,12 @@ class Likelihood:
         return stiffness, distance
 
     @torch.no_grad()
-    def replays(self) -> list[tuple[Group, States, Float[Tensor, "batch samples n_s n_p"]]]:
-        """Groups as the twin replays them: states, and their derivatives by weights and offsets of initial states.
+    def replay(self, group: Group) -> tuple[States, Float[Tensor, "batch samples n_s n_p"]]:
+        """A group as the twin replays it: states, and their derivatives by weights and offsets of initial states.
 
         Raises:
             DivergenceError: if a state is not finite.
         """
-        return [(group, *self._replay(group)) for group in self._groups]
-
-    def _replay(self, group: Group) -> tuple[Tensor, Tensor]:
         first, start, closure = self.initial()[group.numbers], group.times[:, 0], self.twin.closure
         free = bool(self.initial.free)
         ends, S = self.twin.sensitivities(first, group.exogenous, group.actions, start=start, initial=free)
@@ -217,9 +224,10 @@ class Likelihood:
         Raises:
             DivergenceError: if a state is not finite.
         """
-        return [self._residuals(*replay) for replay in self.replays()]
+        return [self._residuals(group) for group in self.groups]
 
-    def _residuals(self, group: Group, states: Tensor, S: Tensor) -> Residuals:
+    def _residuals(self, group: Group) -> Residuals:
+        states, S = self.replay(group)
         weights = group.seen / self.noise
         readings = self._read(group, states)
         values = differences([sensor.measurement for sensor in self.sensors], readings, group.readings)
@@ -245,7 +253,7 @@ class Likelihood:
             DivergenceError: if a state is not finite.
         """
         readings: dict[int, Tensor] = {}
-        for group in self._groups:
+        for group in self.groups:
             first, start = self.initial()[group.numbers], group.times[:, 0]
             flown = self.twin.replay(first, group.exogenous, group.actions, start=start)
             readings |= dict(zip(group.numbers, self._read(group, flown.states), strict=True))
@@ -277,3 +285,56 @@ class Likelihood:
     def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
         """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
         return float((self._priors()[0] * inverse.diagonal()).sum())
+
+
+def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """RMS difference of each sensor's readings from its first one.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    if not records:
+        raise ValueError("records=[] of the estimation must hold at least one record.")
+    readings = torch.cat([record.readings for record in records])
+    scatter = []
+    for sensor, values in zip(sensors, readings.T, strict=True):
+        samples = values[~values.isnan()]
+        if not len(samples):
+            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
+        origin = samples[:1].expand_as(samples)
+        change = differences([sensor.measurement], samples[:, None], origin[:, None])
+        scatter.append(change.square().mean().sqrt())
+    return torch.stack(scatter)
+
+
+def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """Noise levels that are given; for others a share of the scatter of the readings.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    scatter, levels = scatter_of(sensors, records), []
+    size = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
+    for sensor, change, largest in zip(sensors, scatter.tolist(), size.tolist(), strict=True):
+        guess = FIRST_NOISE * change or 1e-6 * max(largest, 1.0)
+        levels.append(guess if sensor.noise is None else sensor.noise)
+    return scatter.new_tensor(levels)
+
+
+def usual_sizes(
+    plant: Plant, first: Float[Tensor, "records n_s"], sensors: Sequence[Sensor], records: Sequence[SensorRecord]
+) -> Float[Tensor, " n_s"]:
+    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it.
+
+    It is the greatest of the scatter of the states that the plant draws, that of what a sensor reads of it, and a tenth
+    of the guess.
+    """
+    drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
+    sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
+    for column, k in enumerate(state_places(plant, sensors)):
+        if k is not None:
+            values = torch.cat([record.readings[:, column] for record in records])
+            values = values[~values.isnan()]
+            scatter = (values - values.mean()).square().mean().sqrt()
+            sizes[k] = torch.fmax(sizes[k], scatter)  # of a sensor without samples there is none
+    return torch.where(sizes > 0.0, sizes, 1.0)

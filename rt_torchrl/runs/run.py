@@ -36,7 +36,7 @@ from rt_torchrl.steps.hypotheses.ensemble import make_twin
 from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
 from rt_torchrl.steps.plan import MakePlanner, make_planner
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, first_live
-from rt_torchrl.steps.switch import MakeReferee, make_referee
+from rt_torchrl.steps.switch import DecisionTree, MakeReferee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.operation import Operation
 from rt_torchrl.systems.preflight import check_record
@@ -93,7 +93,7 @@ class Run:
         learner: MakeLearner | None = None,
         replay: MakeReplay | None = None,
         planner: MakePlanner = make_planner,
-        referee: MakeReferee = make_referee,
+        referee: MakeReferee = DecisionTree,
         collector: MakeCollector = collector_of,
         callbacks: Sequence[Callback] = (),
     ):

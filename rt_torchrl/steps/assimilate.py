@@ -18,9 +18,8 @@ from rt_torchrl.fit.least_squares import (
     Estimation,
     judged,
     over_segments,
-    scatter_of,
 )
-from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
+from rt_torchrl.fit.likelihood import Likelihood, WeightPrior, scatter_of
 from rt_torchrl.fit.sensors import SensorRecord, noise_levels, sensor_records, state_places, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
@@ -311,7 +310,6 @@ class Assimilate(Step):
         belief: what takes the twin's word for a policy, or not.
         short_term: memory D_S of the latest records.
         realisations: number N_z of draws of the inputs for each record.
-        generator: source of the draws.
     """
 
     in_keys = ["record", "large_scale", "live"]
@@ -323,11 +321,10 @@ class Assimilate(Step):
         belief: Belief,
         short_term: Sequence[Trajectory],
         realisations: int,
-        generator: torch.Generator,
     ):
         super().__init__(assimilation=assimilation, belief=belief)
         self.assimilation, self.belief, self.short_term = assimilation, belief, short_term
-        self.realisations, self.generator = realisations, generator
+        self.realisations = realisations
         self.closure_before: dict[str, Any] | None = None
         """State of the closure before the last fit, to which a twin that diverges goes back; None after that."""
 
@@ -342,10 +339,11 @@ class Assimilate(Step):
 
     def fit(self, records: Sequence[Trajectory]) -> TensorDictBase:
         """Fit the twin to records; the report of the fit."""
-        (latest, processes), twin = self.belief.virtual.paired(records), self.belief.virtual.twin
+        virtual = self.belief.virtual
+        (latest, processes), twin = virtual.paired(records), virtual.twin
 
         def draw() -> Trajectory:
-            sampled = torch.cat([process.sample(self.realisations, self.generator) for process in processes])
+            sampled = torch.cat([process.sample(self.realisations, virtual.generator) for process in processes])
             rows = torch.arange(len(latest), device=sampled.device).repeat_interleave(self.realisations)
             return batch_of(latest).rows(rows)._replace(exogenous=twin.plant.with_previews(sampled))
 

@@ -286,19 +286,9 @@ class ActorCritic:
         self._traced = copy.deepcopy(policy)
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep the transitions of a real episode, with their TD errors as priorities.
-
-        Raises:
-            ValueError: if a TD error is not finite in single precision, because the critic has diverged.
-        """
+        """Keep the transitions of a real episode, with their TD errors as priorities."""
         transitions = self.transitions(episode)
-        errors = self.td_errors(transitions)
-        if not errors.float().isfinite().all():
-            raise ValueError(
-                "the TD errors of an episode whose numbers are finite are not finite themselves: the critic has "
-                "diverged. Nothing was stored; use a smaller twinning.learner.reward_scale."
-            )
-        self.memory.store(transitions, errors)
+        self.memory.store(transitions, self.td_errors(transitions))
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
         """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
@@ -648,7 +638,7 @@ class LongTermMemory:
         """
         errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
         if not errors.isfinite().all():
-            raise FloatingPointError("a TD error exceeds the range of single precision")
+            raise FloatingPointError("a TD error exceeds single precision; use a smaller twinning.learner.reward_scale")
         self._prioritise(index.cpu(), (errors + TOL) ** self.prioritisation)
 
     def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:

@@ -92,10 +92,16 @@ class Referee(Protocol):
         """Go on from a :meth:`state_dict`."""
 
 
-class ExpectedCost:
-    """The policy acts that costs less; the idle one becomes a clone when it has stalled for long.
+class DecisionTree:
+    """The paper's decision tree (figure decisionTree), which also decides by expected costs.
 
-    Two policies of equal cost never change roles.
+    The roles swap when the live policy has cost more than the idle one for more than P_π episodes in a row, at once
+    with the rule ``expected_cost``; two policies of equal cost never change roles. Otherwise the idle policy becomes a
+    clone when it has stalled for more than P_w episodes in a row. Each counter restarts when its condition fails; the
+    second counter also restarts while the live policy is worse.
+
+    Note: the paper prints J_live/J_idle < T_J for "the live policy performs worse". Here the condition is >, because a
+    smaller cost is better; T_J is 1, as in all test cases of the paper.
 
     Args:
         config: parameters of step 6.
@@ -105,21 +111,23 @@ class ExpectedCost:
     def __init__(self, config: RefereeConfig, live: Role = "model_free"):
         self.config = config
         self.live: Role = live
+        self.worse_count = 0  # C_π
         self.stall_count = 0  # C_w
 
     def decide(self, evidence: Evidence) -> Event:
-        if evidence.idle_cost < evidence.live_cost:
-            self.live, self.stall_count = other_than(self.live), 0
+        config = self.config
+        if evidence.live_cost > evidence.idle_cost:
+            self.worse_count, self.stall_count = self.worse_count + 1, 0
+            if self.worse_count <= (config.patience if config.rule == "decision_tree" else 0):
+                return "keep"
+            self.worse_count, self.live = 0, other_than(self.live)
             return "swap"
-        return self._stalled(evidence.idle_weight_change)
-
-    def _stalled(self, idle_weight_change: float) -> Event:
-        """Count stalled episodes: ``clone`` if there are more in a row than ``clone_patience``, else ``keep``."""
-        self.stall_count = self.stall_count + 1 if idle_weight_change < STALL else 0
-        if self.stall_count > self.config.clone_patience:
-            self.stall_count = 0
-            return "clone"
-        return "keep"
+        self.worse_count = 0
+        self.stall_count = self.stall_count + 1 if evidence.idle_weight_change < STALL else 0
+        if self.stall_count <= config.clone_patience:
+            return "keep"
+        self.stall_count = 0
+        return "clone"
 
     def state_dict(self) -> dict[str, Any]:
         """The live role and all counters."""
@@ -127,39 +135,6 @@ class ExpectedCost:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-
-
-class DecisionTree(ExpectedCost):
-    """The paper's decision tree (figure decisionTree).
-
-    The roles swap when the live policy has been worse on the twin for more than P_π episodes in a row. Otherwise the
-    idle policy becomes a clone when it has stalled for more than P_w episodes in a row. Each counter restarts when its
-    condition fails; the second counter also restarts while the live policy is worse.
-
-    Note: the paper prints J_live/J_idle < T_J for "the live policy performs worse". Here the condition is >, because a
-    smaller cost is better; T_J is 1, as in all test cases of the paper.
-    """
-
-    def __init__(self, config: RefereeConfig, live: Role = "model_free"):
-        super().__init__(config, live)
-        self.worse_count = 0  # C_π
-
-    def decide(self, evidence: Evidence) -> Event:
-        worse = not math.isfinite(evidence.live_cost) or evidence.live_cost > evidence.idle_cost
-        if not worse:
-            self.worse_count = 0
-            return self._stalled(evidence.idle_weight_change)
-        self.worse_count, self.stall_count = self.worse_count + 1, 0
-        if self.worse_count > self.config.patience:
-            self.worse_count = 0
-            self.live = other_than(self.live)
-            return "swap"
-        return "keep"
-
-
-def make_referee(config: RefereeConfig, live: Role) -> Referee:
-    """The referee that a configuration names; the role ``live`` starts live."""
-    return DecisionTree(config, live) if config.rule == "decision_tree" else ExpectedCost(config, live)
 
 
 MakeReferee = Callable[[RefereeConfig, Role], Referee]
