@@ -54,7 +54,8 @@ from .fit.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
 from .steps.config import LearnerConfig
-from .steps.learn import ActorCritic, Learner, LearningMethod
+from .steps.learn import ActorCritic, Learner
+from .steps.losses import LearningMethod
 from .optimisers.descent import Descended, DescentConfig
 from .algorithm import ReinforcementTwinning
 from .steps.config import (

@@ -12,7 +12,8 @@ from test_algorithm import flown, twinning, weights
 
 from rt_torchrl import DigitalTwin, Planner, PlantEnv, ReinforcementTwinning, WholeEpisodes
 from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
-from rt_torchrl.steps.learn import METHODS, ActorCritic, Learner
+from rt_torchrl.steps.learn import ActorCritic, Learner
+from rt_torchrl.steps.losses import METHODS
 from rt_torchrl.steps.switch import DecisionTree, Referee
 
 PLANT = LinearQuadratic(horizon=2.0)

@@ -33,8 +33,9 @@ from rt_torchrl.runs.run_start import known_physics, start_of
 from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import make_twin
-from rt_torchrl.steps.learn import ActorCritic, MakeLearner, MakeReplay
+from rt_torchrl.steps.learn import ActorCritic, Learner
 from rt_torchrl.steps.plan import MakePlanner, make_planner
+from rt_torchrl.steps.replay_buffer import LongTermMemory
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, first_live
 from rt_torchrl.steps.switch import DecisionTree, MakeReferee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
@@ -90,8 +91,8 @@ class Run:
         env: RealSystem | Callable[[], RealSystem] | None = None,
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
-        learner: MakeLearner | None = None,
-        replay: MakeReplay | None = None,
+        learner: Callable[..., Learner] | None = None,
+        replay: Callable[..., LongTermMemory] | None = None,
         planner: MakePlanner = make_planner,
         referee: MakeReferee = DecisionTree,
         collector: MakeCollector = collector_of,
@@ -148,7 +149,7 @@ class Run:
         env: EnvBase | Operation,
         make_env: Callable[[], EnvBase] | None,
         physics: Plant,
-        makers: tuple[MakeLearner, MakePlanner, MakeReferee],
+        makers: tuple[Callable[..., Learner], MakePlanner, MakeReferee],
         collector: MakeCollector,
     ) -> None:
         config, (make_learner, planner, referee) = self.config, makers

@@ -10,31 +10,29 @@ to the bit, without the time that it takes to find out what to compute.
 import contextlib
 import copy
 import functools
-import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn.utils import get_total_norm, parameters_to_vector
 from torch.utils._pytree import tree_flatten
-from torchrl.data import Bounded, LazyTensorStorage, MultiStep, RoundRobinWriter, TensorDictPrioritizedReplayBuffer
-from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, SoftUpdate, TD3Loss
+from torchrl.data import Bounded, MultiStep
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SoftUpdate
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.policies import mlp
-from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
+from rt_torchrl.steps.losses import METHODS, Critic, LearningMethod, ScaledPolicy
+from rt_torchrl.steps.replay_buffer import LongTermMemory
 from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 
 
@@ -75,142 +73,6 @@ class Learner(Protocol):
         """Go on from the :meth:`state_dict` of a learner with the same configuration."""
 
 
-class LearningMethod(NamedTuple):
-    """A model-free method: the loss, and what it needs.
-
-    Args:
-        make_loss: function of actor and critics, in the form that TorchRL's losses take, that makes the loss. Actions
-            are scaled to [−1, 1].
-        critics: number of critics.
-        stochastic: whether the actor is a distribution around π_mf, whose spread is learned, too.
-        delay: number of critic iterations for each iteration of policy and targets; 0 makes all iterations of the
-            critic first, each with one of its target, and then those of the policy, as the paper does.
-        squared: whether the loss reports δ² as ``td_error``, and not |δ|.
-        normalised: whether the layers of the critics are normalised over a batch.
-        relaxed: whether a critic without targets takes only the share τ of each of its steps.
-        draws: whether the loss draws random numbers.
-        gradient_limit: greatest norm of the policy's gradient.
-        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
-    """
-
-    make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
-    critics: int = 1
-    stochastic: bool = False
-    delay: int = 1
-    squared: bool = True
-    normalised: bool = False
-    relaxed: bool = False
-    draws: bool = True
-    gradient_limit: float = 1.0
-    correction: float = 0.4
-
-
-def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, target: bool = True) -> LossModule:
-    """DDPG, the paper's method (section 4.1), with a target of the critic or without one, as its line 17 has it."""
-    return DDPGLoss(actor, critics[0], loss_function="l2", delay_value=target)
-
-
-def td3_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
-    """TD3: the lower of two values at smoothed target actions (Fujimoto, van Hoof, Meger, ICML 2018)."""
-    return TD3Loss(actor, critics, bounds=(-1.0, 1.0), num_qvalue_nets=len(critics), loss_function="l2")
-
-
-def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]:
-    """A loss that prices the entropy of scaled actions: SAC, CrossQ or REDQ."""
-
-    def make(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
-        n_a = cast(ProbabilisticActor, actor).spec["action"].shape[-1]
-        options = {"num_qvalue_nets": len(critics), "loss_function": "l2", "target_entropy": -float(n_a)}
-        instance = loss(actor, critics, alpha_init=0.1, **options)
-        float(instance.target_entropy)  # REDQ registers it when it is first read, too late for a state that is loaded
-        return instance
-
-    return make
-
-
-METHODS: dict[str, LearningMethod] = {
-    "ddpg": LearningMethod(ddpg_loss, delay=0, draws=False),
-    "relaxed_ddpg": LearningMethod(
-        functools.partial(ddpg_loss, target=False),
-        delay=0,
-        relaxed=True,
-        draws=False,
-        gradient_limit=math.inf,
-        correction=0.0,
-    ),
-    "td3": LearningMethod(td3_loss, critics=2, delay=2),
-    "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
-    "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
-    "redq": LearningMethod(entropic(REDQLoss), critics=4, stochastic=True),
-}
-"""The methods that a configuration can name."""
-
-
-class Critic(nn.Module):
-    """The value q(e, a): a perceptron of the observation and of the action scaled to [−1, 1].
-
-    Args:
-        widths: numbers of inputs and of units of each hidden layer.
-        normalised: whether the inputs of each layer are normalised over a batch.
-        generator: source of the initial weights.
-    """
-
-    def __init__(self, widths: Sequence[int], *, normalised: bool = False, generator: torch.Generator):
-        super().__init__()
-        self.network = mlp(widths[0], widths[1:], 1, generator=generator, activation=nn.SiLU)
-        if normalised:
-            layers, device = list(self.network), generator.device
-            norms = iter([BatchRenorm1d(width).to(device, torch.float64) for width in widths])
-            parts = [[next(norms), layer] if isinstance(layer, nn.Linear) else [layer] for layer in layers]
-            self.network = nn.Sequential(*(part for group in parts for part in group))
-
-    def forward(
-        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch 1"]:
-        return self.network(torch.cat([observation, action], -1))
-
-
-class ScaledPolicy(nn.Module):
-    """A policy with its actions scaled to [−1, 1] or, as a distribution, location and spread before the tanh.
-
-    Args:
-        plant: plant that gives the ranges of the actions.
-        policy: the policy.
-        stochastic: whether it is a distribution around the policy.
-        device: device of the ranges.
-    """
-
-    middle: Tensor
-    half_range: Tensor
-    LEAST, GREATEST = -5.0, 1.0
-    """Bounds on the logarithm of the spread."""
-    EDGE = 1.0 - 1e-6
-    """Greatest scaled action whose location is finite enough."""
-
-    def __init__(self, plant: Plant, policy: nn.Module, *, stochastic: bool, device: torch.device):
-        super().__init__()
-        low, high = bounds(plant.actions, device=device)
-        self.register_buffer("middle", 0.5 * (low + high))
-        self.register_buffer("half_range", 0.5 * (high - low))
-        self.policy = policy
-        self.log_spread = None
-        if stochastic:
-            self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
-            nn.init.zeros_(self.log_spread.weight)
-            nn.init.constant_(self.log_spread.bias, -1.0)
-
-    def scaled(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
-        """Actions from their range to [−1, 1]."""
-        return (action - self.middle) / self.half_range
-
-    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Tensor | tuple[Tensor, Tensor]:
-        share = self.scaled(self.policy(observation))
-        if self.log_spread is None:
-            return share
-        spread = self.log_spread(observation).clamp(self.LEAST, self.GREATEST).exp()
-        return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
-
-
 Key = str | tuple[str, ...]
 NEXT: tuple[Key, ...] = tuple(("next", key) for key in ("observation", "reward", "done", "terminated"))
 TRANSITION: tuple[Key, ...] = ("observation", "action", *NEXT)
@@ -249,7 +111,7 @@ class ActorCritic:
         *,
         generator: torch.Generator,
         method: LearningMethod | None = None,
-        replay: "MakeReplay | None" = None,
+        replay: Callable[..., LongTermMemory] | None = None,
     ):
         if config.return_steps > plant.n_steps:
             raise ValueError(
@@ -563,139 +425,6 @@ def flat(module: GraphModule) -> Callable[..., dict[str, Tensor]]:
     for node in held:
         graph.erase_node(node)
     return functools.partial(GraphModule(nn.Module(), graph).forward, *tensors)
-
-
-TOL = 1e-3
-"""Number tol that is added to every |δ|, so that every transition can be sampled."""
-
-
-class LongTermMemory:
-    r"""The memory D_L, which samples transitions by priority.
-
-    .. math:: P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}
-
-    When it is full, new transitions replace those with the least probability of being sampled (paper, section 4.3).
-    It stands on the CPU.
-
-    Args:
-        capacity: number n_L of transitions that the memory keeps, by default of all episodes of most trainings.
-        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
-        correction: exponent of the importance weights.
-        generator: source of the samples.
-    """
-
-    def __init__(
-        self,
-        capacity: int = 100_000,
-        *,
-        prioritisation: float = 0.6,
-        correction: float = 0.4,
-        generator: torch.Generator,
-    ):
-        self.capacity, self.prioritisation, self.correction = capacity, prioritisation, correction
-        self._generator = generator
-        if generator.device.type != "cpu":
-            seed = torch.randint(2**62, (), generator=generator, device=generator.device)
-            self._generator = torch.Generator(device="cpu").manual_seed(int(seed))
-        self._clear()
-
-    def _clear(self) -> None:
-        self._writer = LeastPriorityWriter(self.capacity)
-        # It takes priorities as they are, because a power is rounded by the place of its number in the memory, and a
-        # training that goes on from a saved state has to sample the same.
-        self.buffer = TensorDictPrioritizedReplayBuffer(
-            alpha=1.0,
-            beta=self.correction,
-            eps=0.0,
-            storage=LazyTensorStorage(self.capacity, device="cpu"),
-            sampler_device="cpu",
-        )
-        self.buffer.set_writer(self._writer)
-        self.buffer.set_rng(self._generator)
-
-    def __len__(self) -> int:
-        return len(self.buffer)
-
-    def store(self, transitions: TensorDictBase, td_errors: Float[Tensor, " n"]) -> None:
-        """Add transitions, a TensorDict of batch size n, with their TD errors δ."""
-        index = self.buffer.extend(transitions.cpu())
-        self.refresh(index, td_errors)
-
-    def sample(self, count: int) -> TensorDictBase:
-        """Draw transitions, with their ``index`` (for :meth:`refresh`) and importance weight ``priority_weight``."""
-        return self.buffer.sample(count)
-
-    def observations(self) -> Float[Tensor, "n n_o"]:
-        """Observations of all transitions, in no particular order."""
-        return self.buffer[:]["observation"]
-
-    def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
-        """Give sampled transitions their new TD errors δ; of several for one transition the last one counts.
-
-        Raises:
-            FloatingPointError: if one is not finite in single precision, as after an update that has diverged; none is
-                then given.
-        """
-        errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
-        if not errors.isfinite().all():
-            raise FloatingPointError("a TD error exceeds single precision; use a smaller twinning.learner.reward_scale")
-        self._prioritise(index.cpu(), (errors + TOL) ** self.prioritisation)
-
-    def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
-        self._writer.priorities[index.numpy()] = priorities.numpy()
-        self.buffer.update_tensordict_priority(TensorDict({"index": index, "td_error": priorities}, [len(index)]))
-
-    def state_dict(self) -> dict[str, Any]:
-        """The transitions in their places with their priorities."""
-        count = len(self)
-        if not count:
-            return {"count": 0}
-        stored = self.buffer[:].flatten_keys(".").to_dict()
-        priorities = torch.from_numpy(self._writer.priorities[:count].copy())
-        generator = self._generator.get_state()
-        return {"count": count, "transitions": stored, "priorities": priorities, "generator": generator}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._clear()
-        if count := state["count"]:
-            transitions = TensorDict(state["transitions"], batch_size=[count], device="cpu")
-            index = self.buffer.extend(transitions.unflatten_keys("."))
-            self._prioritise(index, state["priorities"].cpu())
-            self._generator.set_state(state["generator"].cpu())
-
-
-MakeReplay = Callable[..., LongTermMemory]
-"""Function of ``correction=`` and ``generator=`` that makes a :class:`LongTermMemory`."""
-
-
-class LeastPriorityWriter(RoundRobinWriter):
-    """A writer that fills the storage in order, and then overwrites the transitions with the least current priority.
-
-    TorchRL's ``TensorDictMaxValueWriter`` ranks transitions by their value when they are written. The paper ranks them
-    by the sampling probability, which changes with every update of the critic.
-
-    Args:
-        capacity: number of places.
-    """
-
-    def __init__(self, capacity: int):
-        super().__init__()
-        self.priorities = np.zeros(capacity, dtype=np.float32)
-        """Priority of the transition in each place; of equal ones the first goes first."""
-
-    def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
-        """Write transitions, of which there are no more than places, and return their places."""
-        stored, capacity, n = len(self._storage), len(self.priorities), len(data)
-        free = np.arange(stored, min(stored + n, capacity))
-        evicted = self.priorities[:stored].argsort(kind="stable")[: n - len(free)]
-        index = torch.from_numpy(np.concatenate([free, evicted]))
-        data.set("index", index)
-        self._storage.set(index, data)
-        return index
-
-
-MakeLearner = Callable[..., Learner]
-"""Function of plant, policy, :class:`LearnerConfig` and ``generator=`` that makes the learner of step 2."""
 
 
 class Learn(Step):
