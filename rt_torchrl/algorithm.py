@@ -42,7 +42,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.config import Role, TwinningConfig
+from rt_torchrl.steps.config import EXPERIENCE, Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.inputs import EXTREMES, FitInputs, VirtualEpisodes
@@ -137,7 +137,8 @@ class ReinforcementTwinning(TensorDictSequential):
         extremes = EXTREMES if config.planner.method == "multi_start" else 0
         if extremes and twin.plant.end_cost is not None:  # many episodes hold extreme starts, too
             judged, extremes = OFTEN * judged, 0
-        virtual = VirtualEpisodes(twin, config.exogenous, config.experience, extremes=extremes, generator=generator)
+        kept = max(config.records, 1 if config.planner.method == "single_start" else EXPERIENCE)
+        virtual = VirtualEpisodes(twin, config.exogenous, kept, extremes=extremes, generator=generator)
         corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
         belief, system = Belief(policies, virtual, corrects=corrects), system_of(env)
         actor = LivePolicy(twin.plant, policies[referee.live], config.exploration, generator=generator)

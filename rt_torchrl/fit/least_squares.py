@@ -387,7 +387,7 @@ class Estimation:
         if not equations.matrix.isfinite().all():
             raise FloatingPointError("the derivatives of finite states overflow")
         inverse = inverse_information(equations.matrix).matrix
-        determined = likelihood.count - likelihood.held_back(inverse)
+        determined = likelihood.count - float((likelihood.priors()[0] * inverse.diagonal()).sum())  # by no prior
         given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
         squares = torch.stack([block.values.square().sum((0, 1)) for block in blocks]).sum(0)
         total = int(likelihood.samples.sum())

@@ -185,7 +185,7 @@ class Likelihood:
         """Number of samples of each sensor."""
         return torch.stack([group.seen.sum((0, 1)) for group in self.groups]).sum(0)
 
-    def _priors(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    def priors(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The stiffness of every unknown about the value at which a prior holds it, and its distance from there."""
         offsets = self.initial.offsets
         stiffness, distance = offsets.new_zeros(self.count), offsets.new_zeros(self.count)
@@ -276,15 +276,10 @@ class Likelihood:
             cost = cost + 0.5 * r.square().sum()
             gradient.index_put_((places,), (A.mT @ r.unsqueeze(-1)).squeeze(-1), accumulate=True)
             matrix.index_put_((places.unsqueeze(-1), places.unsqueeze(-2)), A.mT @ A, accumulate=True)
-        stiffness, distance = self._priors()
+        stiffness, distance = self.priors()
         matrix.diagonal().add_(stiffness)
         cost = cost + 0.5 * (stiffness * distance.square()).sum()
         return NormalEquations(cost, gradient + stiffness * distance, matrix)
-
-    @torch.no_grad()
-    def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
-        """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
-        return float((self._priors()[0] * inverse.diagonal()).sum())
 
 
 def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:

@@ -236,11 +236,6 @@ class TwinningConfig:
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     referee: RefereeConfig = field(default_factory=RefereeConfig)
 
-    @property
-    def experience(self) -> int:
-        """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
-        return max(self.records, 1 if self.planner.method == "single_start" else EXPERIENCE)
-
 
 PAPER = TwinningConfig(
     records=1,

@@ -1,4 +1,4 @@
-"""Losses of TorchRL that step 2 learns by, and the networks that they take: a policy with scaled actions, and critics."""
+"""Losses of TorchRL that step 2 learns by, and their networks: a policy with scaled actions, and critics."""
 
 import functools
 import math

@@ -144,7 +144,6 @@ class Fit:
         self.whole = Assimilation(twin, measured)
         """What tells the errors over records, which is not fitted."""
         self.least = math.inf
-        self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], length: int = 0) -> float:
@@ -164,7 +163,7 @@ class Fit:
         least, arrived = self._run(records, FIRST if first else AGAIN)
         if not (first or arrived or least < FAR * self.least):
             present = copy.deepcopy(self.twin.closure.state_dict())
-            self.twin.closure.load_state_dict(self._first)
+            self.twin.closure.load_state_dict(self.short.first)
             anew, _ = self._run(records, FIRST)
             if not anew < least:
                 self.twin.closure.load_state_dict(present)
@@ -209,11 +208,11 @@ class Fit:
         return [self.twin.completed(record) for record in records]
 
     def state_dict(self) -> dict[str, Any]:
-        closures = {"closure": self.twin.closure.state_dict(), "first": self._first}
-        return closures | {"least": self.least, "short": self.short.state_dict(), "whole": self.whole.state_dict()}
+        closure = {"closure": self.twin.closure.state_dict(), "least": self.least}
+        return closure | {"short": self.short.state_dict(), "whole": self.whole.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.least, self._first = state["least"], state["first"]
+        self.least = state["least"]
         self.twin.closure.load_state_dict(state["closure"])
         self.short.load_state_dict(state["short"])
         self.whole.load_state_dict(state["whole"])

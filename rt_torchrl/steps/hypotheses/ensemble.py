@@ -38,7 +38,7 @@ class TwinEnsemble(DigitalTwin):
         engine: see :class:`DigitalTwin`; a hypothesis that the engine cannot roll out has ``autograd``.
 
     Raises:
-        ValueError: if a plant has no closure, or does not extend the twin's plant.
+        ValueError: if a plant does not extend the twin's plant.
     """
 
     def __init__(
@@ -51,8 +51,6 @@ class TwinEnsemble(DigitalTwin):
         engine: Engine = "native",
     ):
         super().__init__(plant, closure, engine=engine)
-        if suspects.keys() != closures.keys():
-            raise ValueError(f"suspects {quoted(suspects)} and closures {quoted(closures)} must have equal names.")
         for name, suspect in suspects.items():
             if suspect.readings != plant.states or suspect.dt != plant.dt:
                 raise ValueError(
