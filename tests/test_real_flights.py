@@ -249,7 +249,8 @@ def test_a_system_that_fails_while_it_is_judged_leaves_the_results_of_the_traini
     metrics = run_on(rig, tmp_path, real_unseen=2, baselines={"PD": PD}, callbacks=[fail]).train()
     assert len(metrics["episodes"]) == 2 and "real_unseen" not in metrics["summary"]
     said = capsys.readouterr().out
-    assert f"PD is not judged on the real system: the system failed in interval 4, at 0.4 s: {cause}" in said
+    why = f"3 real episodes in a row cannot be used: the system failed in interval 4, at 0.4 s: {cause}"
+    assert f"PD is not judged on the real system: {why}" in said
 
 
 def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
