@@ -14,9 +14,8 @@ from torchrl.objectives import DDPGLoss
 
 from rt_torchrl import LearnerConfig, Rollout, SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import equal
-from rt_torchrl.steps.learn import BATCH, ActorCritic, iteration, traced
-from rt_torchrl.steps.losses import METHODS, LearningMethod
-from rt_torchrl.steps.replay_buffer import LongTermMemory
+from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
+from rt_torchrl.steps.losses import BATCH, METHODS, LearningMethod, iteration, traced
 
 GAMMA = 0.9
 PLANT = LinearQuadratic()
@@ -343,7 +342,7 @@ ERRORS = torch.tensor([0.0, 0.1, 0.5, 1.0, 2.0, 5.0, 0.3, 0.3], dtype=torch.floa
 def test_sampling_follows_the_priorities(alpha, monkeypatch):
     """P(i) ∝ (|δ_i| + tol)^α*, by a χ² test at 0.1 %; the draws are seeded, so the outcome is always the same."""
     tol = 0.05
-    monkeypatch.setattr("rt_torchrl.steps.replay_buffer.TOL", tol)
+    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", tol)
     found = memory(prioritisation=alpha)
     found.store(labelled(list(range(8))), -ERRORS)
     counts = torch.zeros(8)

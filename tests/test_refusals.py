@@ -46,7 +46,7 @@ MODULES = """
     envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
     envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log
     plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble steps.learn steps.losses
-    steps.plan steps.replay_buffer systems.config systems.exploration systems.safety
+    steps.plan systems.config systems.exploration systems.safety
 """.split()
 """Modules of the library whose names expressions may use beside the public ones."""
 RECIPES = Path(__file__).parent.parent / "recipes"

@@ -22,8 +22,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.likelihood import Likelihood, WeightPrior, first_noise, scatter_of
-from rt_torchrl.fit.sensors import Sensor, SensorRecord, segments
+from rt_torchrl.fit.likelihood import Likelihood, WeightPrior, first_noise
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, scatter_of, segments
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from rt_torchrl.fit.sensors import Sensor, SensorRecord, held_to_the_end, read, read_slopes, state_places
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, held_to_the_end, read, read_slopes, scatter_of, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant
@@ -280,26 +280,6 @@ class Likelihood:
         matrix.diagonal().add_(stiffness)
         cost = cost + 0.5 * (stiffness * distance.square()).sum()
         return NormalEquations(cost, gradient + stiffness * distance, matrix)
-
-
-def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """RMS difference of each sensor's readings from its first one.
-
-    Raises:
-        ValueError: if there is no record, or a sensor has no sample.
-    """
-    if not records:
-        raise ValueError("records=[] of the estimation must hold at least one record.")
-    readings = torch.cat([record.readings for record in records])
-    scatter = []
-    for sensor, values in zip(sensors, readings.T, strict=True):
-        samples = values[~values.isnan()]
-        if not len(samples):
-            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
-        origin = samples[:1].expand_as(samples)
-        change = differences([sensor.measurement], samples[:, None], origin[:, None])
-        scatter.append(change.square().mean().sqrt())
-    return torch.stack(scatter)
 
 
 def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:

@@ -191,6 +191,26 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
     return [SensorRecord(y, a, z, course[0], start, course=course) for y, a, z, course, start in rows]
 
 
+def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """RMS difference of each sensor's readings from its first one.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    if not records:
+        raise ValueError("records=[] of the estimation must hold at least one record.")
+    readings = torch.cat([record.readings for record in records])
+    scatter = []
+    for sensor, values in zip(sensors, readings.T, strict=True):
+        samples = values[~values.isnan()]
+        if not len(samples):
+            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
+        origin = samples[:1].expand_as(samples)
+        change = differences([sensor.measurement], samples[:, None], origin[:, None])
+        scatter.append(change.square().mean().sqrt())
+    return torch.stack(scatter)
+
+
 def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
     """A record cut into segments, each with a first state of its own (multiple shooting).
 

@@ -19,8 +19,8 @@ from rt_torchrl.fit.least_squares import (
     judged,
     over_segments,
 )
-from rt_torchrl.fit.likelihood import Likelihood, WeightPrior, scatter_of
-from rt_torchrl.fit.sensors import SensorRecord, noise_levels, sensor_records, state_places, state_sensors
+from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
+from rt_torchrl.fit.sensors import SensorRecord, noise_levels, scatter_of, sensor_records, state_places, state_sensors
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt

@@ -9,30 +9,28 @@ to the bit, without the time that it takes to find out what to compute.
 
 import contextlib
 import copy
-import functools
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.fx import GraphModule
-from torch.fx.experimental.proxy_tensor import make_fx
-from torch.nn.utils import get_total_norm, parameters_to_vector
+from torch.nn.utils import parameters_to_vector
 from torch.utils._pytree import tree_flatten
-from torchrl.data import Bounded, MultiStep
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.data import Bounded, LazyTensorStorage, MultiStep, RoundRobinWriter, TensorDictPrioritizedReplayBuffer
+from torchrl.modules import BatchRenorm1d, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import mlp
+from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
-from rt_torchrl.steps.losses import METHODS, Critic, LearningMethod, ScaledPolicy
-from rt_torchrl.steps.replay_buffer import LongTermMemory
+from rt_torchrl.steps.losses import BATCH, METHODS, TRANSITION, LearningMethod, traced
 from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 
 
@@ -73,11 +71,71 @@ class Learner(Protocol):
         """Go on from the :meth:`state_dict` of a learner with the same configuration."""
 
 
-Key = str | tuple[str, ...]
-NEXT: tuple[Key, ...] = tuple(("next", key) for key in ("observation", "reward", "done", "terminated"))
-TRANSITION: tuple[Key, ...] = ("observation", "action", *NEXT)
-BATCH: tuple[Key, ...] = (*TRANSITION, "steps_to_next_obs", "priority_weight")
-"""What a loss reads of a batch."""
+class Critic(nn.Module):
+    """The value q(e, a): a perceptron of the observation and of the action scaled to [−1, 1].
+
+    Args:
+        widths: numbers of inputs and of units of each hidden layer.
+        normalised: whether the inputs of each layer are normalised over a batch.
+        generator: source of the initial weights.
+    """
+
+    def __init__(self, widths: Sequence[int], *, normalised: bool = False, generator: torch.Generator):
+        super().__init__()
+        self.network = mlp(widths[0], widths[1:], 1, generator=generator, activation=nn.SiLU)
+        if normalised:
+            layers, device = list(self.network), generator.device
+            norms = iter([BatchRenorm1d(width).to(device, torch.float64) for width in widths])
+            parts = [[next(norms), layer] if isinstance(layer, nn.Linear) else [layer] for layer in layers]
+            self.network = nn.Sequential(*(part for group in parts for part in group))
+
+    def forward(
+        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch 1"]:
+        return self.network(torch.cat([observation, action], -1))
+
+
+class ScaledPolicy(nn.Module):
+    """A policy with its actions scaled to [−1, 1] or, as a distribution, location and spread before the tanh.
+
+    Args:
+        plant: plant that gives the ranges of the actions.
+        policy: the policy.
+        stochastic: whether it is a distribution around the policy.
+        device: device of the ranges.
+    """
+
+    middle: Tensor
+    half_range: Tensor
+    LEAST, GREATEST = -5.0, 1.0
+    """Bounds on the logarithm of the spread."""
+    EDGE = 1.0 - 1e-6
+    """Greatest scaled action whose location is finite enough."""
+
+    def __init__(self, plant: Plant, policy: nn.Module, *, stochastic: bool, device: torch.device):
+        super().__init__()
+        low, high = bounds(plant.actions, device=device)
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.policy = policy
+        self.log_spread = None
+        if stochastic:
+            self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
+            nn.init.zeros_(self.log_spread.weight)
+            nn.init.constant_(self.log_spread.bias, -1.0)
+
+    def scaled(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
+        """Actions from their range to [−1, 1]."""
+        return (action - self.middle) / self.half_range
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Tensor | tuple[Tensor, Tensor]:
+        share = self.scaled(self.policy(observation))
+        if self.log_spread is None:
+            return share
+        spread = self.log_spread(observation).clamp(self.LEAST, self.GREATEST).exp()
+        return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
+
+
 AT_ONCE = 50
 """Number of batches drawn in one call, between which priorities rest: a draw takes as long as half an iteration."""
 
@@ -111,7 +169,7 @@ class ActorCritic:
         *,
         generator: torch.Generator,
         method: LearningMethod | None = None,
-        replay: Callable[..., LongTermMemory] | None = None,
+        replay: "Callable[..., LongTermMemory] | None" = None,
     ):
         if config.return_steps > plant.n_steps:
             raise ValueError(
@@ -325,106 +383,129 @@ class Adam(torch.optim.Adam):
             part.copy_(saved)
 
 
-@torch.enable_grad()
-def iteration(learner: ActorCritic, kind: str, *batch: Tensor) -> dict[str, Tensor]:
-    """One iteration as TorchRL and torch make it: loss, gradients, steps of the optimisers and of the targets.
+TOL = 1e-3
+"""Number tol that is added to every |δ|, so that every transition can be sampled."""
+
+
+class LongTermMemory:
+    r"""The memory D_L, which samples transitions by priority.
+
+    .. math:: P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}
+
+    When it is full, new transitions replace those with the least probability of being sampled (paper, section 4.3).
+    It stands on the CPU.
 
     Args:
-        learner: learner whose weights change.
-        kind: ``critic``, ``actor`` or ``both``.
-        batch: tensors of a batch, in the order of ``BATCH``.
-
-    Returns:
-        Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
+        capacity: number n_L of transitions that the memory keeps, by default of all episodes of most trainings.
+        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
+        correction: exponent of the importance weights.
+        generator: source of the samples.
     """
-    critic, method = kind != "actor", learner.method
-    transitions = TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])])
-    losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
-    results: dict[str, Tensor] = {}
-    steps = list[tuple[Adam, list[Tensor]]]()
-    if critic:
-        loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
-        gradients = slopes(loss, learner.critic_adam.weights)
-        errors = learner.sizes(transitions["td_error"].detach())
-        results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
-        results["critic_gradient"] = get_total_norm(gradients)
-        steps.append((learner.critic_adam, gradients))
-    if kind != "critic":
-        loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
-        gradients = slopes(loss, learner.actor_adam.weights)
-        norm = get_total_norm(gradients)
-        share = (method.gradient_limit / (norm + TINY)).clamp(max=1.0)
-        results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
-        steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
-    relaxed = learner.critic_adam.weights if critic and method.relaxed else []
-    before = [weight.detach().clone() for weight in relaxed]
-    for optimiser, gradients in steps:
-        optimiser.descend(gradients)
-    with torch.no_grad():
-        for weight, earlier in zip(relaxed, before, strict=True):  # w ← τ w + (1 − τ) w'
-            weight.copy_(torch.lerp(earlier, weight, learner.config.target_rate))
-    if learner.target is not None and critic and (kind == "both" or method.delay == 0):
-        learner.target.step()
-    return results
+
+    def __init__(
+        self,
+        capacity: int = 100_000,
+        *,
+        prioritisation: float = 0.6,
+        correction: float = 0.4,
+        generator: torch.Generator,
+    ):
+        self.capacity, self.prioritisation, self.correction = capacity, prioritisation, correction
+        self._generator = generator
+        if generator.device.type != "cpu":
+            seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+            self._generator = torch.Generator(device="cpu").manual_seed(int(seed))
+        self._clear()
+
+    def _clear(self) -> None:
+        self._writer = LeastPriorityWriter(self.capacity)
+        # It takes priorities as they are, because a power is rounded by the place of its number in the memory, and a
+        # training that goes on from a saved state has to sample the same.
+        self.buffer = TensorDictPrioritizedReplayBuffer(
+            alpha=1.0,
+            beta=self.correction,
+            eps=0.0,
+            storage=LazyTensorStorage(self.capacity, device="cpu"),
+            sampler_device="cpu",
+        )
+        self.buffer.set_writer(self._writer)
+        self.buffer.set_rng(self._generator)
+
+    def __len__(self) -> int:
+        return len(self.buffer)
+
+    def store(self, transitions: TensorDictBase, td_errors: Float[Tensor, " n"]) -> None:
+        """Add transitions, a TensorDict of batch size n, with their TD errors δ."""
+        index = self.buffer.extend(transitions.cpu())
+        self.refresh(index, td_errors)
+
+    def sample(self, count: int) -> TensorDictBase:
+        """Draw transitions, with their ``index`` (for :meth:`refresh`) and importance weight ``priority_weight``."""
+        return self.buffer.sample(count)
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Observations of all transitions, in no particular order."""
+        return self.buffer[:]["observation"]
+
+    def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
+        """Give sampled transitions their new TD errors δ; of several for one transition the last one counts.
+
+        Raises:
+            FloatingPointError: if one is not finite in single precision, as after an update that has diverged; none is
+                then given.
+        """
+        errors = td_errors.detach().float().cpu().abs()  # a sampler with a generator draws in single precision
+        if not errors.isfinite().all():
+            raise FloatingPointError("a TD error exceeds single precision; use a smaller twinning.learner.reward_scale")
+        self._prioritise(index.cpu(), (errors + TOL) ** self.prioritisation)
+
+    def _prioritise(self, index: Int[Tensor, " n"], priorities: Float[Tensor, " n"]) -> None:
+        self._writer.priorities[index.numpy()] = priorities.numpy()
+        self.buffer.update_tensordict_priority(TensorDict({"index": index, "td_error": priorities}, [len(index)]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The transitions in their places with their priorities."""
+        count = len(self)
+        if not count:
+            return {"count": 0}
+        stored = self.buffer[:].flatten_keys(".").to_dict()
+        priorities = torch.from_numpy(self._writer.priorities[:count].copy())
+        generator = self._generator.get_state()
+        return {"count": count, "transitions": stored, "priorities": priorities, "generator": generator}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._clear()
+        if count := state["count"]:
+            transitions = TensorDict(state["transitions"], batch_size=[count], device="cpu")
+            index = self.buffer.extend(transitions.unflatten_keys("."))
+            self._prioritise(index, state["priorities"].cpu())
+            self._generator.set_state(state["generator"].cpu())
 
 
-@torch.no_grad()
-def traced(learner: ActorCritic, kind: str, batch: Sequence[Tensor]) -> Callable[..., dict[str, Tensor]]:
-    """The iteration of batches like this one as a flat graph, or as it is where it cannot be traced.
+class LeastPriorityWriter(RoundRobinWriter):
+    """A writer that fills the storage in order, and then overwrites the transitions with the least current priority.
 
-    The graph holds weights, moments and targets by reference; a batch is its input. What a policy has beside its
-    weights and buffers, such as numbers in attributes, is read now. Nothing is changed.
+    TorchRL's ``TensorDictMaxValueWriter`` ranks transitions by their value when they are written. The paper ranks them
+    by the sampling probability, which changes with every update of the critic.
+
+    Args:
+        capacity: number of places.
     """
-    eager, device = functools.partial(iteration, learner, kind), learner.generator.device
-    state = [*learner.loss.parameters(), *learner.loss.buffers()]
-    state += [*learner.critic_adam.parts, *learner.actor_adam.parts]
-    before = [part.detach().clone() for part in state]
-    try:
-        with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
-            return flat(make_fx(eager)(*batch))
-    except RuntimeError as error:
-        policy = type(learner.policy).__name__
-        warnings.warn(f"Step 2 is slower, because {policy} cannot be traced: {error}", stacklevel=4)
-        return eager
-    finally:
-        for part, saved in zip(state, before, strict=True):
-            part.copy_(saved)
 
+    def __init__(self, capacity: int):
+        super().__init__()
+        self.priorities = np.zeros(capacity, dtype=np.float32)
+        """Priority of the transition in each place; of equal ones the first goes first."""
 
-TINY = 1e-6
-"""Number that ``torch.nn.utils.clip_grad_norm_`` adds to a norm."""
-
-
-def slopes(loss: Tensor, weights: list[nn.Parameter]) -> list[Tensor]:
-    """The gradient of a loss by each of some weights; zero where the loss does not depend on one."""
-    return list(torch.autograd.grad(loss, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
-
-
-PASSED = (torch.ops.aten.detach.default, torch.ops.aten.alias.default)
-"""What changes nothing where no gradients are asked for."""
-
-
-def flat(module: GraphModule) -> Callable[..., dict[str, Tensor]]:
-    """The function of a traced module, without what changes nothing and what nobody reads.
-
-    Weights and other tensors that the module holds become arguments, because each access to them costs as much as a
-    small operation.
-    """
-    graph = module.graph
-    for node in reversed(graph.nodes):
-        if getattr(node.target, "namespace", "") == "profiler":  # marks of the optimisers' steps
-            graph.erase_node(node)
-        elif node.target in PASSED:
-            node.replace_all_uses_with(node.all_input_nodes[0])
-    graph.eliminate_dead_code()
-    held = [node for node in graph.nodes if node.op == "get_attr"]
-    with graph.inserting_before(next(iter(graph.nodes))):
-        for number, node in enumerate(held):
-            node.replace_all_uses_with(graph.placeholder(f"held_{number}"))
-    tensors = [getattr(module, node.target).detach() for node in held]
-    for node in held:
-        graph.erase_node(node)
-    return functools.partial(GraphModule(nn.Module(), graph).forward, *tensors)
+    def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
+        """Write transitions, of which there are no more than places, and return their places."""
+        stored, capacity, n = len(self._storage), len(self.priorities), len(data)
+        free = np.arange(stored, min(stored + n, capacity))
+        evicted = self.priorities[:stored].argsort(kind="stable")[: n - len(free)]
+        index = torch.from_numpy(np.concatenate([free, evicted]))
+        data.set("index", index)
+        self._storage.set(index, data)
+        return index
 
 
 class Learn(Step):

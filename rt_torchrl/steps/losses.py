@@ -1,20 +1,23 @@
-"""Losses of TorchRL that step 2 learns by, and their networks: a policy with scaled actions, and critics."""
+"""Losses of TorchRL that step 2 learns by, and one iteration by a loss: traced once, and replayed as a flat graph."""
 
 import functools
 import math
+import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
-from jaxtyping import Float
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.modules import BatchRenorm1d, ProbabilisticActor, ValueOperator
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.nn.utils import get_total_norm
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLoss, TD3Loss
 
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.policies import mlp
-from rt_torchrl.plants.signal import bounds
+if TYPE_CHECKING:
+    from rt_torchrl.steps.learn import ActorCritic, Adam
 
 
 class LearningMethod(NamedTuple):
@@ -88,66 +91,110 @@ METHODS: dict[str, LearningMethod] = {
 """The methods that a configuration can name."""
 
 
-class Critic(nn.Module):
-    """The value q(e, a): a perceptron of the observation and of the action scaled to [−1, 1].
+Key = str | tuple[str, ...]
+NEXT: tuple[Key, ...] = tuple(("next", key) for key in ("observation", "reward", "done", "terminated"))
+TRANSITION: tuple[Key, ...] = ("observation", "action", *NEXT)
+BATCH: tuple[Key, ...] = (*TRANSITION, "steps_to_next_obs", "priority_weight")
+"""What a loss reads of a batch."""
+
+
+@torch.enable_grad()
+def iteration(learner: "ActorCritic", kind: str, *batch: Tensor) -> dict[str, Tensor]:
+    """One iteration as TorchRL and torch make it: loss, gradients, steps of the optimisers and of the targets.
 
     Args:
-        widths: numbers of inputs and of units of each hidden layer.
-        normalised: whether the inputs of each layer are normalised over a batch.
-        generator: source of the initial weights.
+        learner: learner whose weights change.
+        kind: ``critic``, ``actor`` or ``both``.
+        batch: tensors of a batch, in the order of ``BATCH``.
+
+    Returns:
+        Loss, errors |δ| of the transitions and their mean, value, and norms of the gradients, by name.
     """
+    critic, method = kind != "actor", learner.method
+    transitions = TensorDict(dict(zip(BATCH, batch, strict=True)), batch_size=[len(batch[0])])
+    losses = {key: loss for key, loss in learner.loss(transitions).items() if key.startswith("loss_")}
+    results: dict[str, Tensor] = {}
+    steps = list[tuple["Adam", list[Tensor]]]()
+    if critic:
+        loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
+        gradients = slopes(loss, learner.critic_adam.weights)
+        errors = learner.sizes(transitions["td_error"].detach())
+        results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
+        results["critic_gradient"] = get_total_norm(gradients)
+        steps.append((learner.critic_adam, gradients))
+    if kind != "critic":
+        loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
+        gradients = slopes(loss, learner.actor_adam.weights)
+        norm = get_total_norm(gradients)
+        share = (method.gradient_limit / (norm + TINY)).clamp(max=1.0)
+        results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
+        steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
+    relaxed = learner.critic_adam.weights if critic and method.relaxed else []
+    before = [weight.detach().clone() for weight in relaxed]
+    for optimiser, gradients in steps:
+        optimiser.descend(gradients)
+    with torch.no_grad():
+        for weight, earlier in zip(relaxed, before, strict=True):  # w ← τ w + (1 − τ) w'
+            weight.copy_(torch.lerp(earlier, weight, learner.config.target_rate))
+    if learner.target is not None and critic and (kind == "both" or method.delay == 0):
+        learner.target.step()
+    return results
 
-    def __init__(self, widths: Sequence[int], *, normalised: bool = False, generator: torch.Generator):
-        super().__init__()
-        self.network = mlp(widths[0], widths[1:], 1, generator=generator, activation=nn.SiLU)
-        if normalised:
-            layers, device = list(self.network), generator.device
-            norms = iter([BatchRenorm1d(width).to(device, torch.float64) for width in widths])
-            parts = [[next(norms), layer] if isinstance(layer, nn.Linear) else [layer] for layer in layers]
-            self.network = nn.Sequential(*(part for group in parts for part in group))
 
-    def forward(
-        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch 1"]:
-        return self.network(torch.cat([observation, action], -1))
+@torch.no_grad()
+def traced(learner: "ActorCritic", kind: str, batch: Sequence[Tensor]) -> Callable[..., dict[str, Tensor]]:
+    """The iteration of batches like this one as a flat graph, or as it is where it cannot be traced.
 
-
-class ScaledPolicy(nn.Module):
-    """A policy with its actions scaled to [−1, 1] or, as a distribution, location and spread before the tanh.
-
-    Args:
-        plant: plant that gives the ranges of the actions.
-        policy: the policy.
-        stochastic: whether it is a distribution around the policy.
-        device: device of the ranges.
+    The graph holds weights, moments and targets by reference; a batch is its input. What a policy has beside its
+    weights and buffers, such as numbers in attributes, is read now. Nothing is changed.
     """
+    eager, device = functools.partial(iteration, learner, kind), learner.generator.device
+    state = [*learner.loss.parameters(), *learner.loss.buffers()]
+    state += [*learner.critic_adam.parts, *learner.actor_adam.parts]
+    before = [part.detach().clone() for part in state]
+    try:
+        with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
+            return flat(make_fx(eager)(*batch))
+    except RuntimeError as error:
+        policy = type(learner.policy).__name__
+        warnings.warn(f"Step 2 is slower, because {policy} cannot be traced: {error}", stacklevel=4)
+        return eager
+    finally:
+        for part, saved in zip(state, before, strict=True):
+            part.copy_(saved)
 
-    middle: Tensor
-    half_range: Tensor
-    LEAST, GREATEST = -5.0, 1.0
-    """Bounds on the logarithm of the spread."""
-    EDGE = 1.0 - 1e-6
-    """Greatest scaled action whose location is finite enough."""
 
-    def __init__(self, plant: Plant, policy: nn.Module, *, stochastic: bool, device: torch.device):
-        super().__init__()
-        low, high = bounds(plant.actions, device=device)
-        self.register_buffer("middle", 0.5 * (low + high))
-        self.register_buffer("half_range", 0.5 * (high - low))
-        self.policy = policy
-        self.log_spread = None
-        if stochastic:
-            self.log_spread = nn.Linear(len(plant.observations), len(low), dtype=torch.float64, device=device)
-            nn.init.zeros_(self.log_spread.weight)
-            nn.init.constant_(self.log_spread.bias, -1.0)
+TINY = 1e-6
+"""Number that ``torch.nn.utils.clip_grad_norm_`` adds to a norm."""
 
-    def scaled(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
-        """Actions from their range to [−1, 1]."""
-        return (action - self.middle) / self.half_range
 
-    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Tensor | tuple[Tensor, Tensor]:
-        share = self.scaled(self.policy(observation))
-        if self.log_spread is None:
-            return share
-        spread = self.log_spread(observation).clamp(self.LEAST, self.GREATEST).exp()
-        return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
+def slopes(loss: Tensor, weights: list[nn.Parameter]) -> list[Tensor]:
+    """The gradient of a loss by each of some weights; zero where the loss does not depend on one."""
+    return list(torch.autograd.grad(loss, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
+
+
+PASSED = (torch.ops.aten.detach.default, torch.ops.aten.alias.default)
+"""What changes nothing where no gradients are asked for."""
+
+
+def flat(module: GraphModule) -> Callable[..., dict[str, Tensor]]:
+    """The function of a traced module, without what changes nothing and what nobody reads.
+
+    Weights and other tensors that the module holds become arguments, because each access to them costs as much as a
+    small operation.
+    """
+    graph = module.graph
+    for node in reversed(graph.nodes):
+        if getattr(node.target, "namespace", "") == "profiler":  # marks of the optimisers' steps
+            graph.erase_node(node)
+        elif node.target in PASSED:
+            node.replace_all_uses_with(node.all_input_nodes[0])
+    graph.eliminate_dead_code()
+    held = [node for node in graph.nodes if node.op == "get_attr"]
+    with graph.inserting_before(next(iter(graph.nodes))):
+        for number, node in enumerate(held):
+            node.replace_all_uses_with(graph.placeholder(f"held_{number}"))
+    tensors = [getattr(module, node.target).detach() for node in held]
+    for node in held:
+        graph.erase_node(node)
+    return functools.partial(GraphModule(nn.Module(), graph).forward, *tensors)
