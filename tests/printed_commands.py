@@ -32,9 +32,13 @@ def options() -> list[str]:
     return list(dict.fromkeys(span for page in TEXTS for span in spans(page) if span.startswith("--")))
 
 
+def run_code(page: str, code: str | None = None, **scope: object) -> dict[str, object]:
+    """What the Python code of a page, or this code of it, defines."""
+    exec(compile(code or "\n".join(blocks(page, "python")), f"docs/{page}", "exec"), scope)
+    return scope
+
+
 def documented(page: str, name: str) -> type:
     """The class of this name from the code on a page of the documentation."""
     (code,) = [code for code in blocks(page, "python") if f"class {name}" in code]
-    scope: dict[str, type] = {}
-    exec(code, scope)
-    return scope[name]
+    return run_code(page, code)[name]

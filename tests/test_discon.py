@@ -9,7 +9,7 @@ import pytest
 import torch
 from c_build import COMPILER, library, needs_compiler
 from linear_quadratic import LinearQuadratic
-from printed_commands import TEXTS, blocks
+from printed_commands import TEXTS, blocks, run_code
 from seeds_and_numbers import drawn, seeded
 
 from rt_torchrl import DISCON, SaturatedAffine, StateFeedback, export_discon
@@ -245,7 +245,7 @@ def test_the_code_of_the_page_prints_what_it_says(capfd):
     (code,) = blocks("discon.md", "python")
     for dt, cost in (("0.1", "0.0434"), ("0.5", "0.0495")):
         assert f"prints {cost}" in TEXTS["discon.md"]
-        exec(compile(code.replace("dt=0.1", f"dt={dt}"), "docs/discon.md", "exec"), {})
+        run_code("discon.md", code.replace("dt=0.1", f"dt={dt}"))
         assert f"tensor({cost}, dtype=torch.float64)" in capfd.readouterr().out
 
 

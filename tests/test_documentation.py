@@ -12,7 +12,7 @@ from pathlib import Path
 import fresh_process
 import pytest
 import torch
-from printed_commands import ROOT, TEXTS, blocks
+from printed_commands import ROOT, TEXTS, blocks, run_code
 from tensordict import TensorDict
 from test_export_recipe import RECIPES, leave_run
 
@@ -53,7 +53,7 @@ def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
     leave_finished_run(tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     code = "\n".join(blocks("finished_run.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
-    exec(compile(code.replace("diagnose(run)", "diagnose(run, episodes=2)"), "docs/finished_run.md", "exec"), {})
+    run_code("finished_run.md", code.replace("diagnose(run)", "diagnose(run, episodes=2)"))
     shown = capsys.readouterr().out
     assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
     assert shown.count(" | ") == 6 * 3  # six reasons
@@ -62,10 +62,8 @@ def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
 
 def tutorial_with_suspects():
     """What the plant of the tutorial and the page of hypotheses define."""
-    scope = {"__name__": "tutorial"}
-    exec(compile(blocks("own_plant.md", "python")[0], "docs/own_plant.md", "exec"), scope)
-    exec(compile("\n".join(blocks("hypotheses.md", "python")), "docs/hypotheses.md", "exec"), scope)
-    return scope
+    tutorial = run_code("own_plant.md", blocks("own_plant.md", "python")[0], __name__="tutorial")
+    return run_code("hypotheses.md", **tutorial)
 
 
 def test_the_suspects_of_the_tutorial_plant_are_plants():
@@ -96,8 +94,7 @@ def test_the_extension_of_the_documentation_finds_a_leak():
 
 
 def test_the_real_turbine_has_what_its_twin_does_not_know():
-    scope = {}
-    exec(compile("\n".join(blocks("unknown_systems.md", "python")), "docs/unknown_systems.md", "exec"), scope)
+    scope = run_code("unknown_systems.md")
     assert len(scope["real"].states) > len(scope["twin"].states)
 
 
@@ -109,23 +106,19 @@ def test_every_block_of_code_is_marked_as_python():
 def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
     leave_finished_run(tmp_path / "run")
     monkeypatch.chdir(tmp_path)
-    code = "\n".join(blocks("gallery.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
-    exec(compile(code, "docs/gallery.md", "exec"), {})
+    run_code("gallery.md", "\n".join(blocks("gallery.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run"))
     assert (tmp_path / "power_and_speed.png").exists() and (tmp_path / "flights.png").exists()
 
 
 def test_the_callback_of_the_documentation_ends_a_training():
-    scope = {}
-    exec(compile(blocks("habits.md", "python")[0], "docs/habits.md", "exec"), scope)
-    said = scope["cheap_enough"]
+    said = run_code("habits.md", blocks("habits.md", "python")[0])["cheap_enough"]
     assert said([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
     assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
 
 
 def test_the_callback_of_the_documentation_tells_a_logger(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    scope = {}
-    exec(compile(blocks("habits.md", "python")[1], "docs/habits.md", "exec"), scope)
+    scope = run_code("habits.md", blocks("habits.md", "python")[1])
     record = {"episode": 0, "real_cost": 0.5, "rms/speed [rad/s]": 0.1, "live": "model_free"}
     assert scope["to_logger"]([record]) is None
     (curve,) = tmp_path.rglob("real_cost.csv")
@@ -137,9 +130,8 @@ def test_the_search_of_the_documentation_runs(tmp_path, monkeypatch):
     """As printed, with a single trial; the same code goes on with the search."""
     pytest.importorskip("optuna", reason="a search needs the extra sweep")
     monkeypatch.chdir(tmp_path)
-    code, scope = blocks("habits.md", "python")[2].replace("n_trials=10", "n_trials=1"), {}
     for done in (1, 2):
-        exec(compile(code, "docs/habits.md", "exec"), scope)
+        scope = run_code("habits.md", blocks("habits.md", "python")[2].replace("n_trials=10", "n_trials=1"))
         assert len(scope["search"].trials) == done
     costs = [
         json.loads(Path(f"runs/search/0-{seed}/metrics.json").read_text())["summary"]["unseen"]["J_a_model_based"]
@@ -179,10 +171,6 @@ def test_the_site_builds_without_warnings(tmp_path):
 # The code and the commands of the README are right.
 
 
-TUTORIAL = (ROOT / "docs" / "own_plant.md").read_text(encoding="utf-8")
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-
 def test_its_code_runs(monkeypatch):
     from rt_torchrl import ReinforcementTwinning
 
@@ -192,10 +180,7 @@ def test_its_code_runs(monkeypatch):
         "episode",
         lambda self: self.module["interact"](TensorDict({"number": 0}).set_non_tensor("live", self.referee.live)),
     )
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    scope = {}
-    exec(code, scope)
-    assert scope["report"]["real_cost"] > 0
+    assert run_code("README.md")["report"]["real_cost"] > 0
 
 
 def headings(page):
@@ -205,7 +190,8 @@ def headings(page):
 
 
 def test_its_files_exist():
-    for link in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
+    readme = TEXTS["README.md"]
+    for link in re.findall(r"\]\(((?!http|#)[^)]+)\)", readme) + re.findall(r"uv run (recipes/\S+\.py)", readme):
         path, _, heading = link.partition("#")
         assert (ROOT / path).exists(), link
         assert not heading or heading in headings(path), link
@@ -214,7 +200,7 @@ def test_its_files_exist():
 @pytest.mark.slow
 def test_the_tutorial_runs_as_it_is_printed(tmp_path):
     """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
-    code = "\n".join(re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL))
+    code = "\n".join(blocks("own_plant.md", "python"))
     lines = [line for line in code.splitlines() if line.strip() and not line.strip().startswith("#")]
     assert len(lines) < 65
     done = fresh_process.run(code, cwd=tmp_path)
@@ -225,8 +211,7 @@ def test_the_tutorial_runs_as_it_is_printed(tmp_path):
 
 
 def test_the_pictures_of_the_gallery_are_those_that_its_script_draws():
-    page = (RECIPES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
     drawn = runpy.run_path(str(RECIPES.parent / "docs" / "gallery.py"))["PICTURES"]
     pictures = {f"{plant}_{name}" for plant, names in drawn.items() for name in names}
-    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", page))
+    assert pictures == set(re.findall(r"\(gallery/([\w.]+)\)", TEXTS["gallery.md"]))
     assert all((RECIPES.parent / "docs" / "gallery" / name).is_file() for name in pictures)

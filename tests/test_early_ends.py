@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from printed_commands import blocks
+from printed_commands import run_code
 from seeds_and_numbers import drawn, seeded
 from small_runs import SMALL
 from test_anchored import replays_on
@@ -287,9 +287,7 @@ def test_what_does_not_go_with_ends_is_refused(tmp_path):
 
 
 def test_the_plant_of_the_documentation_breaks_its_rod():
-    scope = {}
-    exec(compile("\n".join(blocks("real_system.md", "python")), "docs/real_system.md", "exec"), scope)
-    plant = scope["Fragile"]()
+    plant = run_code("real_system.md")["Fragile"]()
     assert plant.ended(torch.tensor([[3.0, -7.6], [7.6, 7.4]]).double()).tolist() == [True, False]
     start, inputs = plant.draw_initial_state(3, seeded()), torch.zeros(3, 5, 0).double()
     flown = rt.Trajectory(torch.full((3, 6, 2), 8.0).double(), torch.zeros(3, 5, 1).double(), inputs)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from printed_commands import blocks
+from printed_commands import blocks, run_code
 from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, room_records
 from test_uncertainty import position
 
@@ -125,8 +125,7 @@ def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
 
 
 def test_the_example_of_the_documentation_runs():
-    names = {}
-    exec(blocks("identify.md", "python")[0], names)
+    names = run_code("identify.md", blocks("identify.md", "python")[0])
     estimate, plant = names["estimate"], names["plant"]
     assert estimate.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
     true = plant.closure.named_coefficients()

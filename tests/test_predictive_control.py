@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from printed_commands import blocks
+from printed_commands import blocks, run_code
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from seeds_and_numbers import drawn, seeded
+from test_exogenous import autoregressive
 
 from rt_torchrl import Decaying, DivergenceError, PlantEnv, Rollout, StateFeedback, control_cost
 from rt_torchrl.control.command_cost import PENALTY, CommandCost
@@ -136,14 +137,9 @@ def test_a_model_that_diverges_leaves_a_command_that_does_not():
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 
 
-def first_order(time, dt, *, episodes=40, n=4000):
+def first_order(time, dt):
     """Records of an Ornstein-Uhlenbeck process of unit variance around 2."""
-    generator = torch.Generator().manual_seed(0)
-    q, noise = math.exp(-dt / time), torch.randn(episodes, n, generator=generator, dtype=torch.float64)
-    values = [noise[:, 0]]
-    for k in range(1, n):
-        values.append(q * values[-1] + math.sqrt(1.0 - q * q) * noise[:, k])
-    return 2.0 + torch.stack(values, 1)
+    return 2.0 + torch.from_numpy(np.stack([autoregressive(4000, math.exp(-dt / time), seed) for seed in range(40)]))
 
 
 def test_a_decaying_forecast_goes_to_the_mean():
@@ -241,7 +237,7 @@ def test_the_code_of_the_page_prints_what_its_table_says(horizon, capsys):
     costs = []
     for own in ("", ", forecast=forecast"):
         short = code.replace("WindTurbine()", f"WindTurbine(horizon={horizon})").replace(", forecast=forecast", own)
-        exec(compile(short, "docs/planner.md", "exec"), {})
+        run_code("planner.md", short)
         costs.append(float(capsys.readouterr().out))
     assert costs[1] < costs[0] and (horizon < 600.0 or costs[1] == pytest.approx(0.01182, abs=1e-5))
 

@@ -79,8 +79,6 @@ def test_a_training_flies_its_episodes_and_nothing_else_and_is_judged_on_the_twi
     paid, unseen, said = summary["cost_of_learning"], summary["unseen"], capsys.readouterr().out
     assert paid["episodes"] == 2 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert "judged on 3 unseen ones on the twin" in said and "flights on the real system" not in said
-    rows = [line for line in said.splitlines() if line.lstrip().startswith("J_a ")]
-    assert len(rows) == 2 and all("on the twin" in row for row in rows)
     # A J_p on episodes that only the twin has flown would be zero; there is none.
     assert unseen["J_p"]["mean"] is None and unseen["J_p_before"]["mean"] is None
     # The same flights in a loop of our own, under the law that the twin has found.
@@ -170,7 +168,6 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     summary, said = metrics["summary"], capsys.readouterr().out
     live = summary["live"]
     assert f"8 flights on the real system, which count as paid: 2 of {live}, 2 of cascade, 2 of mine, 2 of PD" in said
-    assert "J_a PD on the real system " in said
     paid = summary["cost_of_learning"]
     assert paid["episodes"] == 11 and paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
     assert paid["largest"] == pytest.approx(max(rig.costs), rel=1e-9)
@@ -180,9 +177,7 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     ratio, pairs = flown["PD"]["ratio"], [live / other for live, other in zip(costs[live], costs["PD"], strict=True)]
     assert ratio["mean"] == pytest.approx(sum(costs[live]) / sum(costs["PD"]), rel=1e-9)
     assert ratio["confidence_interval"] == pytest.approx(sorted(pairs), rel=1e-9)
-    interval = f"[{min(pairs):.4g}, {max(pairs):.4g}]"
-    words_of_both = f"{ratio['mean']:.4g} {interval} of it, cheaper in {flown['PD']['cheaper']} of 2"
-    assert f"the live policy costs {words_of_both}" in said
+    assert f"the live policy costs {ratio['mean']:.4g} [{min(pairs):.4g}, {max(pairs):.4g}] of it" in said
     assert [cost for each in costs.values() for cost in each] == pytest.approx(rig.costs[3:], rel=1e-9)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     policy = run.algorithm.policies[live]

@@ -3,8 +3,9 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from test_classical import PD
 
-from rt_torchrl import ClassicalController, DigitalTwin, ExogenousConfig
+from rt_torchrl import DigitalTwin, ExogenousConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
@@ -174,15 +175,10 @@ def test_noise_hides_no_twin_that_is_wrong(share):
     assert belief.unexplained == pytest.approx(abs(belief.compared()[-1].d), rel=0.1)
 
 
-class Proportional(ClassicalController):
-    """The linear gain of readings."""
-
-    gain_units = {"position": "N/m", "velocity": "N s/m"}
-    default_gains = (0.3, 0.3)
-
+class Proportional(PD):
     def law(self, state, memory, exogenous):
-        assert exogenous.shape[-1] == 1
-        return -(state * self.gains).sum(-1, keepdim=True), memory
+        assert exogenous.shape[-1] == 1  # without the noise
+        return super().law(state, memory, exogenous)
 
 
 def test_unseen_episodes_on_the_twin_meet_the_noise_of_the_sensors():

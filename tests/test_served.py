@@ -17,7 +17,7 @@ import pytest
 import served_turbine
 import torch
 from linear_quadratic import LinearQuadratic
-from printed_commands import blocks
+from printed_commands import blocks, run_code
 from relay import Relay
 from seeds_and_numbers import Time, drawn
 from served_plants import free_port, served, served_turbine_alone
@@ -249,9 +249,8 @@ def test_the_example_makes_a_real_system_that_connects_at_its_reset():
     pytest.importorskip("asyncua")
     pytest.importorskip("pymodbus")
     code, modbus = blocks("connect_your_machine.md", "python")
-    names = {}
-    exec(modbus, names)
-    exec(code.replace("opc.tcp://rig:4840", f"opc.tcp://127.0.0.1:{free_port()}"), names)  # nobody listens there
+    nobody = code.replace("opc.tcp://rig:4840", f"opc.tcp://127.0.0.1:{free_port()}")
+    names = run_code("connect_your_machine.md", nobody, **run_code("connect_your_machine.md", modbus))
     system = names["machine"]()
     assert isinstance(names["link"], rt.ModbusLink) and system.pace.period == system.plant.dt == 0.05
     with pytest.raises(rt.LinkLostError):

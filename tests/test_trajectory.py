@@ -11,7 +11,8 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from scipy.linalg import expm
 from scipy.optimize import brentq
-from seeds_and_numbers import double
+from seeds_and_numbers import double, seeded
+from seeds_and_numbers import drawn as episodes_of
 from torch import nn
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Rollout, identification_cost, shipped_plants
@@ -39,10 +40,8 @@ def held_solution(state, inputs, dt):
     return np.array(states)
 
 
-def drawn(plant, batch, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    state, exogenous = plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)
-    return state, exogenous, torch.randn(batch, plant.n_steps, 1, generator=generator, dtype=torch.float64)
+def drawn(plant, batch):
+    return *episodes_of(plant, batch), torch.randn(batch, plant.n_steps, 1, generator=seeded(9), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -134,13 +133,8 @@ def test_unstable_steps_are_refused_with_advice_that_works(rate):
 
 def twin_and_policy():
     plant = LinearQuadratic(horizon=1.0)
-    generator = torch.Generator().manual_seed(0)
-    twin = DigitalTwin(plant, LinearClosure(0.1 * torch.randn(2, 2, generator=generator)))
-    return (
-        twin,
-        plant.make_policy(generator),
-        (plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)),
-    )
+    twin = DigitalTwin(plant, LinearClosure(0.1 * torch.randn(2, 2, generator=seeded())))
+    return twin, plant.make_policy(seeded(1)), episodes_of(plant, 3, seed=2)
 
 
 def test_planning_holds_the_closure_constant_and_changes_no_gradient_of_the_policy():

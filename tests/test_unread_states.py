@@ -8,7 +8,7 @@ import test_extensions as extensions
 import torch
 from c_build import needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from printed_commands import blocks
+from printed_commands import run_code
 from seeds_and_numbers import drawn, seeded, stepped
 from small_runs import SMALL
 from test_classical import PD
@@ -293,6 +293,5 @@ def test_past_observations_are_what_sensors_read_then():
 
 def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = {}
-    exec("\n".join(blocks("observations_and_costs.md", "python")), found)
+    found = run_code("observations_and_costs.md")
     assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
