@@ -88,14 +88,6 @@ def help_of(name):
     return shown.getvalue()
 
 
-def test_an_option_that_does_not_exist_is_found():
-    """Otherwise the tests above would show nothing."""
-    assert "--planer" in refusal("wind_turbine", ["--planer", "1"])
-    assert refusal("wind_turbine", ["--policy", "cubic"]) and refusal(
-        "identify", whole("identify", ["--initial", "guessed"])
-    )
-
-
 def test_checks_that_are_printed_are_what_ci_runs():
     """The tests do not run themselves, nor the type checker over everything."""
     script = [line.removesuffix(" &") for line in (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()]

@@ -232,9 +232,6 @@ def test_the_device_refuses_what_a_gpu_refuses():
         generator, here = torch.Generator(device=device), torch.ones(3, device=device)
         for mixes in (
             lambda: here + torch.ones(3),
-            lambda: torch.cat([here, torch.ones(1)]),
-            lambda: torch.ones(3)[torch.zeros(1, dtype=torch.long, device=device)],
-            lambda: torch.ones(()).add_(here[0]),
             lambda: torch.randn(3, generator=generator),
             lambda: torch.randn(3, generator=torch.Generator(), device=device),
         ):

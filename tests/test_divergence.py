@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl import AssimilationConfig, DivergenceError, RefereeConfig, Snapshot, figures
+from rt_torchrl import AssimilationConfig, DivergenceError, RefereeConfig
 from rt_torchrl.steps.report import metrics
 
 
@@ -52,16 +52,6 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step, we
     for role in found.policies:
         assert torch.equal(weights(found.policies[role]), weights(sound.policies[role]))
     assert report["J_a_model_based"] == expected["J_a_model_based"]
-
-
-def test_the_figure_of_a_twin_that_diverges_on_the_record_says_so():
-    found = twinning()
-    found.episode()
-    fill(found.twin.closure, 1e300)
-    snapshot = Snapshot.take(found, found.twin.closure, [])
-    drawn = figures.states(snapshot)
-    assert snapshot.replay[1:].isnan().all()
-    assert {ax.get_title(loc="right") for ax in drawn.axes} == {"RMS diverges"}
 
 
 def test_a_twin_that_diverges_with_the_earlier_closure_too_does_not_end_the_training(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from printed_commands import blocks, run_code
-from small_plants import Envelope, Line, Slope, flown, line_segment, noise_of, room_records
+from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_uncertainty import position
 
 from rt_torchrl import DigitalTwin, Measurement, Sensor, sensor_record, sensors_of
@@ -71,38 +71,6 @@ def test_a_line_with_holes_is_fitted_as_by_regression():
     assert judged(found.likelihood).rms.item() == pytest.approx(math.sqrt(residual[0] / 80), rel=1e-6)
     np.testing.assert_allclose(list(found.uncertainty.standard_errors().values()), errors[2:], rtol=0.01)
     np.testing.assert_allclose(found.uncertainty.initial_errors()[:, 0].numpy(), errors[:2], rtol=0.01)
-
-
-def test_a_room_is_identified_through_its_air_with_its_uncertainty():
-    """The hidden start of the wall is an unknown: 60, 90 and 4 come out, as a fit that guesses it does not find."""
-    plant, sensors, records = room_records()
-    start = torch.tensor([30.0, 150.0, 8.0])
-    closure = Envelope(start)
-    found = Estimation(DigitalTwin(plant, closure), sensors).run(records)
-    errors = found.uncertainty.standard_errors()
-    for name, true in zip(Envelope.names, Envelope.true_coefficients, strict=True):
-        assert abs(found.after[name] - true) < 3.0 * errors[name] < 0.1 * true
-    assert found.noise["air"] == pytest.approx(0.05, rel=0.15)  # 280 samples: ±4 % is one standard error
-    assert ((found.initial[:, 1] - 14.5).abs() < 3.5).all() and not found.uncertainty.warnings()
-    known = torch.zeros(2).double()
-    guessed = Envelope(start)
-    Estimation(DigitalTwin(plant, guessed), sensors, spread=known).run(records)
-    wrong = (guessed.coefficients - torch.tensor(Envelope.true_coefficients).double()).abs()
-    assert wrong[1] > 10.0 * errors["outdoors"]
-
-
-def test_what_one_sensor_cannot_tell_is_said():
-    """Of ẍ only two coefficients follow from x: the velocity may be any combination v + βx, scaled by any factor."""
-    plant, generator = LinearQuadratic(noise=0.5), torch.Generator().manual_seed(0)
-    sensors = sensors_of(plant, ["position"])
-    records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (50,))]
-    records = [r._replace(readings=r.readings + 0.01 * torch.randn(51, 1, generator=generator)) for r in records]
-    found = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors).run(records)
-    # The force enters ẍ with a known factor, so that the scale is known and only β is free.
-    (message,) = (text for text in found.uncertainty.warnings() if "at most combinations" in text)
-    assert "matrix[0,0], matrix[1,0], matrix[1,1]" in message
-    unknown = [name for name, error in found.uncertainty.standard_errors().items() if math.isinf(error)]
-    assert unknown == ["matrix[0,0]", "matrix[1,0]", "matrix[1,1]"]
 
 
 def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():

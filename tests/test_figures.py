@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from figure_reading import draw, line, panel, snapshot_of
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from matplotlib.axes import Axes
 from small_runs import IDLE
 
-from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Signal, Snapshot, Trajectory, figures
+from rt_torchrl import DigitalTwin, PlantEnv, ReinforcementTwinning, Rollout, Snapshot, figures
 from rt_torchrl.envs.cryogenic_tank import figures as tank_figures
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -139,23 +139,6 @@ def test_contours_are_the_policies(name, request, monkeypatch):
         assert x[0] <= seen[:, 0].min() and seen[:, 1].max() <= y[-1]
     labels = draw(figure)
     assert {signal.label for signal in (*snapshot.plant.actions, *snapshot.plant.observations)} <= labels
-
-
-class Observing(LinearQuadratic):
-    """The oscillator seen through the first of its states."""
-
-    observations = (Signal(symbol="e", name="error", unit="-", low=-1.0, high=1.0),)
-
-    def observe(self, t, state, exogenous):
-        return state[..., :1]
-
-
-def test_policies_of_one_observation_are_curves(oscillator):
-    gain = torch.tensor([[0.5]], dtype=torch.float64)
-    policies = {"model_based": LinearGain(gain), "model_free": LinearGain(0.0 * gain)}
-    figure = figures.policy_contours(replace(oscillator, plant=Observing(), policies=policies))
-    curve = line(figure.axes[0], "model-based")
-    np.testing.assert_allclose(curve.get_ydata(), -0.5 * curve.get_xdata(), rtol=1e-15)
 
 
 def test_learning_curves_and_timeline(oscillator):
@@ -311,23 +294,10 @@ def test_tank_is_the_record(tank):
     assert load.get_xlim() == pytest.approx((0.0, 6.0), rel=1e-12)
 
 
-def test_long_records_are_thinned_to_mean_and_range(tank):
-    # Twice the six hours and a bit: groups of three, the last with one sample.
-    record = tank.record
-    n = 2 * len(record.actions) + 1
-    repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in record[:3]]
-    states = torch.cat([repeated[0], repeated[0][-1:]])
-    record = Trajectory(states, *repeated[1:])
-    long = replace(tank, record=record, replay=states, large_scale=repeated[2], realisations=None)
-    figure = tank_figures.tank(long)
-    load, values = panel(figure, "heat load"), repeated[2][:, 0].numpy()
-    drawn = line(load, "real").get_ydata()
-    assert n % 3 == 1 and len(drawn) == (n + 2) // 3 <= tank_figures.POINTS
-    assert drawn[5] == pytest.approx(values[15:18].mean(), rel=1e-12)
-    assert drawn[-1] == values[-1]
-    vertices = load.collections[0].get_paths()[0].vertices[:, 1]
-    assert (vertices.min(), vertices.max()) == (values.min(), values.max())
-    assert any("every 1.5 min" in text for text in draw(figure))
+def test_policies_of_one_observation_are_curves(tank):
+    curve = line(figures.policy_contours(tank).axes[0], "model-based")
+    expected = tank.policies["model_based"](torch.from_numpy(curve.get_xdata()).unsqueeze(-1))[:, 0]
+    np.testing.assert_allclose(curve.get_ydata(), expected.detach().numpy(), rtol=1e-12)
 
 
 def test_heat_exchanger_of_each_closure(tank):
@@ -403,22 +373,10 @@ def test_polars_are_those_of_the_closures(drone):
     assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
 
 
-def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(drone):
+def test_control_surfaces_lie_over_an_error_and_its_rate(drone):
     figure = drone_figures.control_surfaces(drone)
     contours = [ax for ax in figure.axes if ax.get_title(loc="left") in ("model-based", "model-free")]
     assert len(contours) == 8
     planes = {(ax.get_xlabel(), ax.get_ylabel()) for ax in contours if ax.get_ylabel()}
     e_x, e_z, de_x, de_z = (signal.label for signal in drone.plant.observations)
     assert planes == {(e_x, de_x), (e_z, de_z)}
-    for ax in contours:
-        k = contours.index(ax) % 4 // 2
-        policy = drone.policies[ax.get_title(loc="left").replace("-", "_")]
-        filled, observation = ax.collections[0], torch.zeros(4, dtype=torch.float64)
-        plane = [0, 2] if ax.get_xlabel() == e_x else [1, 3]
-        corner = [ax.get_xlim()[0], ax.get_ylim()[1]]
-        observation[plane] = torch.tensor(corner, dtype=torch.float64)
-        value = policy(observation)[k].item()
-        level = np.searchsorted(filled.levels, value) - 1
-        # The corner is a vertex of the band that holds its value.
-        distance = np.linalg.norm(filled.get_paths()[level].vertices - corner, axis=1)
-        assert distance.min() < 1e-9

@@ -252,26 +252,6 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "order"),
-    [("ddpg", ["critic"] * 7 + ["actor"] * 4), ("td3", ["critic", "both"] * 3 + ["critic"]), ("sac", ["both"] * 7)],
-)
-def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, order):
-    found, kinds, sizes = learner(algorithm, critic_iterations=7, actor_iterations=4, batch_size=64), [], []
-    memory = filled(explored(20), found)
-    sample = memory.sample
-
-    def noted(learner, kind, batch):
-        return lambda *batch: kinds.append(kind) or iteration(learner, kind, *batch)
-
-    monkeypatch.setattr("rt_torchrl.steps.learn.traced", noted)
-    monkeypatch.setattr(memory, "sample", lambda size: sizes.append(size) or sample(size))
-    found.update()
-    assert kinds == order
-    # n_b = 64, but at most n_t = 50; many batches are drawn in one call.
-    assert sizes == [350, 200] if algorithm == "ddpg" else [350]
-
-
-@pytest.mark.parametrize(
     ("algorithm", "updates", "spread", "options"),
     [
         # Measured at the end: 0.07 to 0.09 of ‖K*‖.

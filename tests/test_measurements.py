@@ -123,18 +123,6 @@ def test_virtual_episodes_preview_their_own_wind():
     assert virtual.draw(2).exogenous.shape == (2, plant.n_steps, 4)
 
 
-def test_an_episode_that_ended_early_keeps_the_previews_that_were_read():
-    plant = WindTurbine(horizon=60.0, observe=("preview",))
-    plant.end_cost = 5.0
-    state, wind = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())[0]
-    actions = double(3e4, 2.0).expand(20, 2)
-    record = rt.Trajectory(state.expand(21, -1), actions, wind[:20])
-    virtual = VirtualEpisodes(rt.DigitalTwin(plant, plant.closure), rt.ExogenousConfig(), 1, generator=seeded())
-    again = virtual.repeated(record).exogenous[0]
-    assert torch.equal(again[:20], wind[:20])
-    assert torch.equal(again[20:40, 0], wind[:20, 0].flip(0)) and torch.equal(again[20:-8, 2], again[28:, 0])
-
-
 # What policies of some sensors see, and twins that trainings identify without noise.
 
 

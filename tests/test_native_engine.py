@@ -1,7 +1,6 @@
 """Engine native against backpropagation, over batches, lengths, threads, memory, and weights of every kind."""
 
 import warnings
-from collections import OrderedDict
 from contextlib import nullcontext
 
 import pytest
@@ -11,7 +10,6 @@ from seeds_and_numbers import seeded
 from test_gradients import Case, assert_equal
 from torch import nn
 
-from rt_torchrl.trajectories.engines import code
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.engines.native import Native
 from rt_torchrl.trajectories.rollout import Rollout, drive_of
@@ -148,25 +146,6 @@ def test_single_precision_is_left_to_torch():
         rollout(case.initial_state, case.exogenous)
 
 
-class NotBackwards(nn.Module):
-    """A closure whose recurrence becomes a program, and whose gradient does not."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(2, dtype=torch.float64))
-
-    def forward(self, features):
-        return nn.functional.hardshrink(features * self.weight, 0.1)
-
-
-def test_where_the_gradient_is_no_program_torch_computes_it():
-    case = case_of()
-    case.closure = NotBackwards()
-    with pytest.warns(UserWarning, match="hardshrink_backward"):
-        found = case.gradients("native")
-    assert_equal(found, case.gradients("autograd"))
-
-
 class Drained(LinearQuadratic):
     """A plant with a Python branch on its state."""
 
@@ -187,24 +166,3 @@ def test_a_python_branch_has_the_gradient_of_the_branch_that_was_taken():
         gradients.append(torch.autograd.grad((flown.states**2).mean(), closure.matrix)[0])
     assert flown.states[..., 0].min() < 0.0 < flown.states[..., 0].max()  # both branches are taken
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=0.0)
-
-
-class Saturated(nn.Module):
-    """A policy whose gradient is rounding: 1 − tanh² of about 18 is some units in the last place of one."""
-
-    def __init__(self, bias):
-        super().__init__()
-        self.weight = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
-        self.bias = nn.Parameter(torch.tensor(bias, dtype=torch.float64))
-
-    def forward(self, observation):
-        return torch.tanh(self.bias + (observation * self.weight).sum(-1, keepdim=True))
-
-
-@pytest.mark.parametrize("bias", [17.0, 18.36])
-def test_the_rounding_of_a_saturated_policy_is_no_reason_to_refuse_it(bias, monkeypatch):
-    monkeypatch.setattr(code, "_codes", OrderedDict())  # policies of the same kind share their programs
-    case = case_of(batch=4, n=10)
-    case.policy = Saturated(bias)
-    case.rollout("native").costs(case.initial_state, case.exogenous).mean().backward()
-    assert case.policy.weight.grad.abs().max() < 1e-12

@@ -1,7 +1,6 @@
 """NaN, infinity and signed zeros in machine code, over every kind of lanes, as torch has them."""
 
 import math
-import threading
 
 import llvmlite.binding as llvm
 import pytest
@@ -131,13 +130,3 @@ def test_a_failure_is_raised(failing):
 
     with pytest.raises(ArithmeticError, match=f"group {failing}"):
         for_each_group(21, 8, work)
-
-
-def test_groups_run_at_the_same_time():
-    torch_threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        meeting = threading.Barrier(2, timeout=20.0)  # which one thread alone would wait for in vain
-        for_each_group(2, 1, lambda group: meeting.wait() and None)
-    finally:
-        torch.set_num_threads(torch_threads)

@@ -94,20 +94,6 @@ def test_the_cheapest_of_all_random_policies_is_a_start(monkeypatch):
     assert len(set(random)) == 8 and planning.planner.begun == [3.0, min(random)]
 
 
-def test_a_random_start_has_drawn_weights_where_layers_share_them():
-    class Twice(torch.nn.Module):
-        def __init__(self, gain):
-            super().__init__()
-            self.one = self.other = LinearGain(gain)
-
-        def forward(self, observation):
-            return 0.5 * (self.one(observation) + self.other(observation))
-
-    planning = multi_start(Twice([[3.0, 2.0]]), belief_of(), lambda generator: Twice([[1.0, 0.5]]))
-    planning.virtual.cost = lambda policy, episodes: policy.one.gain.sum().item()
-    assert {tuple(weight.flatten().tolist()) for weight in planning._random(1, EPISODES).values()} == {(1.0, 0.5)}
-
-
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
 def test_starts_that_find_nothing_change_no_training(optimiser, monkeypatch):
     """Nor do they change what the next plan depends on: random numbers, and moments of Adam."""

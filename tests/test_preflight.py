@@ -225,9 +225,8 @@ def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
     assert words in str(raised.value) and f"{plant.states[0].unit}, predicted to" in str(raised.value)
 
 
-@pytest.mark.parametrize("name", ["torque has the other sign", "torque does not arrive"])
-def test_a_mistake_that_noise_hides_in_one_interval_shows_over_several(name):
-    plant, wiring, words = MISTAKES[name]
+def test_a_mistake_that_noise_hides_in_one_interval_shows_over_several():
+    plant, wiring, words = MISTAKES["torque does not arrive"]
     assert words in rt.check_real_system(wired(plant, noise=0.01, **wiring), plant).mistakes[0]
 
 
@@ -257,14 +256,6 @@ def test_dynamics_that_the_twin_lacks_are_no_mistake(name):
     plant, systems = UNKNOWN[name]
     check = rt.check_real_system(wired(plant, real=systems.unknown(plant, (name,))), plant)
     assert not check.mistakes and check.present.share.max() > 1e-2
-
-
-def test_a_large_share_that_no_mistake_explains_is_a_warning_that_names_state_and_share():
-    check = rt.check_real_system(wired(PENDULUM, real=Shaken(horizon=5.0)), PENDULUM)
-    share = check.present.share[1].item()
-    assert share > 0.2 and len(check.doubts) == 1 and check.doubts[0] in str(check)
-    with pytest.warns(UserWarning, match=f"leaves .*{100.0 * share:.3g} % of angular_speed unexplained, which is no"):
-        check.require()
 
 
 def test_noise_of_sensors_is_said_and_no_warning():
@@ -341,7 +332,7 @@ def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_
 
 def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
     config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
-    with pytest.warns(UserWarning, match="the twin leaves"):
+    with pytest.warns(UserWarning, match=r"leaves .*[2-9]\d\.\d % of angular_speed unexplained, which is no"):
         metrics = rt.Run(config, PENDULUM, env=wired(PENDULUM, real=Shaken(horizon=5.0))).train()
     (doubt,) = metrics["episodes"][0]["doubts"]
     for note in ("neighbouring residuals of angle (0.9) are alike", ""):  # without one the residuals are noise

@@ -89,15 +89,6 @@ def test_it_names_each_step_as_it_begins():
     assert told == STEPS and set(dashboard.WORDS) == {"start", "fit", "imitation", *STEPS}
 
 
-def test_the_table_says_why_a_policy_is_live_and_what_the_other_half_gave():
-    episodes = [{"episode": 1, "event": "clone", "update_accepted": 0.0}]
-    episodes += [{"episode": 2, "event": "swap", "update_accepted": 1.0}]
-    episodes[-1] |= {"expected/model_free": 2.0, "expected/model_based": 2.5}
-    (line,) = results.live_lines("model_free", episodes)
-    parts = "model-free, expected to cost 2 on", "model-based 2.5", "kept: 1 of 2", "a clone after episode 1"
-    assert all(part in line for part in parts)
-
-
 def test_a_log_has_a_line_for_each_episode_and_for_what_changes_or_begins_after_a_while(monkeypatch, capsys):
     with Progress(3) as bar:
         bar.doing("checking the gradient")

@@ -267,24 +267,3 @@ def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
     assert len(small.train()["episodes"]) == 1
     # An endless loop is left in the time of an iteration; all else of this training takes seconds.
     assert time.perf_counter() - begin < 60
-
-
-def test_a_second_interrupt_leaves_at_once_whatever_became_of_it(tmp_path, monkeypatch, capsys):
-    run = small_run(tmp_path, episodes=3, **QUICK)
-    run_one = run.algorithm.episode
-
-    def interrupted(tell):
-        if run.episodes:
-            press()
-            try:
-                press()
-                time.sleep(1)
-            except KeyboardInterrupt:
-                raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
-        return run_one(tell)
-
-    monkeypatch.setattr(run.algorithm, "episode", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run.train()
-    assert "1 episodes done are in" in capsys.readouterr().out
-    assert len(small_run(tmp_path, episodes=2, resume=True, **QUICK).train()["episodes"]) == 2

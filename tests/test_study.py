@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 import json
 import math
-import os
-import signal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +15,6 @@ from scipy.optimize import minimize
 from rt_torchrl import Comparison, compare_runs
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.compare import FinishedRun, Row, comparison_figure, paired_ratio
-from rt_torchrl.steps.interact import Interact
 
 TINY = Path(__file__).with_name("small_recipe.py")
 NAN = None  # in the place of what is not finite
@@ -225,26 +222,6 @@ def test_two_arms_and_two_seeds(tmp_path, capsys):
     assert len(longer) == 2 and longer[0] == json.loads(written["twinning", 0])["episodes"][0]
     with pytest.raises(ValueError, match="seed-0 holds a run of other options: episodes is 1 here and was 2"):
         study.main(config(tmp_path))
-
-
-def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatch):
-    forward, calls = Interact.forward, []
-
-    def pressed(step, episode):
-        calls.append(step)
-        if len(calls) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return forward(step, episode)
-
-    made = config(tmp_path, given="--episodes 2", optimum=False)
-    with monkeypatch.context() as patched:
-        patched.setattr(Interact, "forward", pressed)
-        with pytest.raises(KeyboardInterrupt):
-            study.studied(made)
-    first, second = (tmp_path / "tiny" / "twinning" / f"seed-{seed}" for seed in (0, 1))
-    assert len(json.loads((first / "metrics.json").read_text())["episodes"]) == 1 and not second.exists()
-    (comparison,), failures = study.studied(made)
-    assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]
 
 
 def test_a_training_that_fails_stops_no_other(tmp_path, capsys):

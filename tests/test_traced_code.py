@@ -1,6 +1,5 @@
 """The contract of traced code: right, or refused with the line and the remedy; nothing is silently wrong."""
 
-import gc
 import re
 import warnings
 from collections import OrderedDict
@@ -22,7 +21,6 @@ from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines import code
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.engines.native import Native
-from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout
 
 EQUAL, REFUSED, IMPURE, MIXED = (snippets.TABLE[name] for name in ("equal", "refused", "impure", "mixed"))
@@ -43,27 +41,6 @@ def test_refused_with_the_line_of_the_code_and_the_remedy(case):
         traced(snippet, *signals(11, 3))
     assert re.search(r"snippets\.(py|txt):\d+: .", str(refusal.value)) or case == "deepcopy", refusal.value
     assert re.search(REMEDIES, str(refusal.value))
-
-
-def test_what_other_libraries_do_in_a_collection_of_garbage_is_not_traced():
-    """JAX adds a callback like this one, which reads what may change."""
-    collected = []
-
-    def callback(phase, info):
-        collected.append(phase)
-
-    def collecting(module, state, drive):
-        return state + len([[k] for k in range(1000)])
-
-    threshold = gc.get_threshold()
-    gc.callbacks.append(callback)
-    gc.set_threshold(1)
-    try:
-        found, exact = compared(Snippet(collecting), *signals(11, 3))[0]
-    finally:
-        gc.set_threshold(*threshold)
-        gc.callbacks.remove(callback)
-    assert collected and gc.isenabled() and gap(found, exact) < 1e-10
 
 
 @pytest.mark.parametrize("case", IMPURE)
@@ -140,38 +117,6 @@ def test_a_buffer_is_an_input(change, monkeypatch):
     assert len(made) == 1
 
 
-def roots(m, s, d):
-    return torch.where(s > m.level, (s - m.level).sqrt(), 0.0) * m.w0
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_gradient_that_is_no_number_is_not_traced_again_and_again(share, monkeypatch):
-    """The gradient of a branch that is not taken is NaN. Where torch has one, it is compared."""
-    made, snippet = counted(monkeypatch), Snippet(roots)
-    snippet.level = 0.0
-    state, drive = signals(16, 4)
-    state = state.abs() * torch.where(torch.arange(16) % 2 < 2 * share, 1.0, -1.0).unsqueeze(-1)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        for _ in range(6):
-            ends = Native().end_states(snippet, state.requires_grad_(), drive)
-            exact = Autograd().end_states(snippet, state, drive)
-            torch.testing.assert_close(ends, exact)
-    assert len(made) == 1
-    assert [str(each.message) for each in said if "no finite gradient" in str(each.message)] == [] or not share
-    assert sum("no finite gradient" in str(each.message) for each in said) == (0 if share else 1)
-
-
-def test_the_engine_parallel_takes_attention():
-    """Whose operator has a backward pass, and no forward-mode derivative."""
-    (snippet, _), (state, drive) = EQUAL["scaled dot product"], signals(4, 3)
-    gradients = []
-    for engine in (Parallel(), Autograd()):
-        ends = engine.end_states(snippet, state.requires_grad_(), drive)
-        gradients.append(torch.autograd.grad(ends.square().sum(), [state, snippet.w0]))
-    torch.testing.assert_close(*gradients)
-
-
 # What is read and changes
 
 
@@ -200,17 +145,6 @@ def test_a_change_is_followed_or_the_thing_is_refused_by_name(kind, monkeypatch)
         assert any(refusal in text and any(map(text.count, remedies)) for text in refusals), refusals
     else:
         assert not refusals
-
-
-def test_what_no_code_reads_of_a_class_may_change(monkeypatch):
-    """Such as a number of instances."""
-    made, plant = counted(monkeypatch), changes.with_attributes(instances=0)
-    for count in range(3):
-        type(plant).instances = count
-        cost(plant, "native", {})
-    assert len(made) == 1
-    type(plant).running_cost = lambda self, t, state, applied, exogenous: 0.0 * state[..., 0]
-    assert cost(plant, "native", {}) == cost(plant, "autograd", {}) and len(made) == 2
 
 
 # What is no function of its arguments is refused in words, by every engine and on every path that flies it
