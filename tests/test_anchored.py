@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import drawn
 
 from rt_torchrl import DigitalTwin, ExogenousConfig, Extension, LaggedActuator, Plant, Signal, Transition
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -20,13 +21,12 @@ from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 def flown_on(real, policy, physics, *, seed=0, count=2):
     """Records of the real system under a policy, the inputs, and J_a."""
-    generator = torch.Generator().manual_seed(seed)
-    starts, inputs = real.draw_initial_state(count, generator), real.draw_exogenous(count, generator)
+    starts, inputs = drawn(real, count, seed)
     with torch.no_grad():
         rollout = Rollout(real, real.closure, policy)
         flown, costs = rollout(starts, inputs), rollout.costs(starts, inputs)
@@ -178,11 +178,6 @@ def belief_of(gains, real=None, physics=None, *, twin=None):
     return belief
 
 
-def virtual_episodes(physics, count=20):
-    generator = torch.Generator().manual_seed(99)
-    return Scenario(physics.draw_initial_state(count, generator), physics.draw_exogenous(count, generator))
-
-
 def test_a_twin_that_has_been_right_keeps_the_word():
     belief = belief_of([(0.5, 0.5), (0.6, 0.5)], LinearQuadratic())
     assert belief.correction(LinearGain([[2.0, 2.0]])).item() == 0.0 and belief.anchors() is None
@@ -306,19 +301,9 @@ def test_a_twin_that_is_wrong_by_any_factor_is_not_believed(factor, expected):
     assert belief.expected(LinearGain([[0.51, 0.5]]), 1.0) > 100.0
 
 
-def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
-    real, physics = pushed(horizon=2.0)
-    (record,), _, cost = flown_on(real, LinearGain([[0.5, 0.5]]), physics, count=1)
-    belief, wild = belief_of([], real, physics), LinearGain([[-1e40, 0.0]])
-    belief.append(record, "model_based", cost.item(), weights=wild.state_dict())
-    assert belief.contradicted and belief.anchors() is None and [flight.d for flight in belief.compared()] == [5.0]
-    assert belief.expected(wild, 1.0) == pytest.approx(math.exp(5.0 + 0.5 * NOISE**2))
-    assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == 1.0
-
-
 def test_a_belief_that_corrects_nothing_withdraws_what_another_one_said():
-    belief, policy, episodes = belief_of([(0.5, 0.5)]), LinearGain([[0.5, 0.5]]), virtual_episodes(LinearQuadratic())
-    twin = belief.virtual.twin
+    belief, policy = belief_of([(0.5, 0.5)]), LinearGain([[0.5, 0.5]])
+    twin, episodes = belief.virtual.twin, drawn(LinearQuadratic(), 20, 99)
     assert twin.expected_costs(policy, *episodes).mean() > 1.1 * twin.episode_costs(policy, *episodes).mean()
     Belief({"model_based": policy}, belief.virtual, corrects=False)
     assert torch.equal(twin.expected_costs(policy, *episodes), twin.episode_costs(policy, *episodes))

@@ -12,13 +12,10 @@ from linear_quadratic import LinearQuadratic
 from printed_commands import TEXTS, blocks, run_code
 from seeds_and_numbers import drawn, seeded
 
-from rt_torchrl import DISCON, SaturatedAffine, StateFeedback, export_discon
-from rt_torchrl.contract.check import require_controller
+from rt_torchrl import DISCON, SaturatedAffine, export_discon
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.controller import Controller
-from rt_torchrl.trajectories.state_feedback import Remembering
 
 N_G = 97.0
 HALF = 2.0**-24
@@ -186,10 +183,6 @@ def test_a_library_may_fail_or_warn(tmp_path):
     for _ in range(2):  # a failed library is left behind
         with pytest.raises(ValueError, match=r"fails\.so failed at t = 1 s: no oil"):
             fails.fly(start, wind)
-    clings = DISCON(plant, compiled(tmp_path, '{ *fail = s[0] < 0.0f ? -1 : 0; strcpy(message, "stay"); }', "clings"))
-    with pytest.raises(ValueError, match=r"clings\.so failed at t = 4.5 s: stay"):
-        clings.fly(start, wind)
-    clings.begin()
     warns = DISCON(plant, compiled(tmp_path, '{ *fail = 1; strcpy(message, "little oil"); }', "warns"))
     with pytest.warns(UserWarning, match=r"warns\.so: little oil"):
         assert warns.fly(start, wind).actions.shape == (1, 10, 2)
@@ -209,20 +202,6 @@ def test_what_is_no_library_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=words):
             DISCON(*arguments)
-
-
-def test_a_controller_by_a_library_is_judged_as_a_classical_one(scheduled):
-    """A training takes a class; none of its flights is compiled, because the library is no function of a memory."""
-    plant = WindTurbine(observe=("scheduled",), horizon=20.0)
-
-    class Ours(DISCON):
-        def __init__(self, plant):
-            super().__init__(plant, scheduled[2])
-
-    require_controller("baselines['ours']", Ours, plant)
-    controller, unseen = Ours(plant), UnseenEpisodes(plant, 2)
-    assert isinstance(controller, StateFeedback) and not isinstance(controller, Remembering)
-    assert unseen.judge(unseen.fly(controller)).control_costs.isfinite().all()
 
 
 def test_roscos_controller_flies_our_turbine(capfd):
@@ -247,6 +226,3 @@ def test_the_code_of_the_page_prints_what_it_says(capfd):
         assert f"prints {cost}" in TEXTS["discon.md"]
         run_code("discon.md", code.replace("dt=0.1", f"dt={dt}"))
         assert f"tensor({cost}, dtype=torch.float64)" in capfd.readouterr().out
-
-
-# What is exported, and what is not.

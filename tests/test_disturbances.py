@@ -164,7 +164,6 @@ def patched(content, offset, form, value):
     "spoil, message",
     [
         (lambda c: c[:-100], "holds 6579 bytes, but its header implies 6679 bytes"),
-        (lambda c: c + b"\0", "holds 6680 bytes, but its header implies 6679 bytes"),
         (lambda c: c[:30], "holds 30 bytes, but the header alone takes 70 bytes"),
         (lambda c: patched(c, 0, "<h", 4), "is no TurbSim full field, .*identifier=4"),
         (lambda c: patched(c, 2, "<i", -5), "is no TurbSim full field, .*n_z=-5"),

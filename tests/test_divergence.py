@@ -54,17 +54,6 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step, we
     assert report["J_a_model_based"] == expected["J_a_model_based"]
 
 
-def test_a_twin_that_diverges_with_the_earlier_closure_too_does_not_end_the_training(monkeypatch):
-    found = twinning()
-    unsound(found, monkeypatch, {0})
-    monkeypatch.setattr(found.twin.closure, "load_state_dict", lambda state: None)
-    before = weights(found.policies["model_based"])
-    report = found.episode()
-    assert report["alarm"] == 1.0 and "diverges under a policy that has flown" in report["warning"]
-    assert "step left out: " in report["reason"] and "plan_accepted" not in report
-    assert torch.equal(weights(found.policies["model_based"]), before)
-
-
 @pytest.mark.parametrize("live, idle", [("model_free", "model_based"), ("model_based", "model_free")])
 def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch, live, idle):
     """The closure that was just found stays, the training goes on, and the live policy stays live."""

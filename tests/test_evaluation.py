@@ -18,7 +18,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
-from rt_torchrl.trajectories.rollout import ENGINES, DivergenceError
+from rt_torchrl.trajectories.rollout import ENGINES
 
 
 def test_excesses_over_bounds_by_hand():
@@ -106,12 +106,3 @@ def test_an_engine_whose_gradient_is_another_one_trains_nothing(engine, tmp_path
     ):
         run.train()
     assert not run.episodes
-
-
-def test_a_start_under_which_the_plant_diverges_is_a_dear_one():
-    unseen, gains = UnseenEpisodes(LinearQuadratic(noise=0.0), 4), iter([1e200, 0.5, 1e200])
-    search = {"iterations": 5, "few": 2, "polish": 2}
-    found = exact_optimum(unseen, lambda _: LinearGain([[next(gains)] * 2]), starts=2, **search)
-    assert found.costs[0] == math.inf and found.cost <= found.by_gradients < math.inf
-    with pytest.raises(DivergenceError, match="under each of the 1 first policies"):
-        exact_optimum(unseen, lambda _: LinearGain([[next(gains)] * 2]), starts=1, **search)

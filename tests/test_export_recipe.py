@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -103,19 +102,6 @@ def test_bad_options_are_refused(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         export.main(export.Config(run=tmp_path, **options))
     assert not (tmp_path / "exported").exists()
-
-
-def test_without_the_packages_of_onnx_all_else_is_written(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
-    leave_run(tmp_path, "wind_turbine", policy="bias")
-    export = recipe("export")
-    config = export.Config(run=tmp_path, what=("policy", "twin"), formats=("onnx", "c"), name="blade")
-    with pytest.raises(
-        ValueError, match="onnxscript is not installed: install the extra, pip install 'rt_torchrl.export.'"
-    ):
-        export.main(config)
-    written = {path.name for path in (tmp_path / "exported").iterdir()}
-    assert written == {"blade.c", "blade.h", "blade_twin.c", "blade_twin.h"}
 
 
 def test_folders_that_hold_no_run_are_refused(tmp_path):

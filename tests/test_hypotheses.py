@@ -66,9 +66,8 @@ PLANT = Suspecting(horizon=10.0)
 
 def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continuous_adjoint():
     """The engine odeint_adjoint cannot follow their schemes; that of the twin alone errs by the order of the step."""
-    plant = Suspecting(horizon=10.0)
-    policy, generator = LinearGain([[0.3, 0.4]]), torch.Generator().manual_seed(2)
-    scenario = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, :20]
+    plant, policy = Suspecting(horizon=2.0), LinearGain([[0.3, 0.4]])
+    scenario = drawn(plant, 2, 2)
     gradients = {}
     for engine in ("native", "odeint_adjoint"):
         closure = LinearClosure([[0.0, 0.0], [-0.2, 0.1]])

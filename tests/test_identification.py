@@ -17,7 +17,6 @@ from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
-pd = pytest.importorskip("pandas")
 RECIPES = Path(__file__).parent.parent / "recipes"
 record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
@@ -204,21 +203,6 @@ def test_a_twin_that_diverges_over_whole_records_begins_with_what_short_segments
     assert closure.coefficients.item() == pytest.approx(0.5, rel=1e-4)
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    """Half a minute of the turbine under Jonkman's controller, with a gap; the speed in rpm, the time in ms."""
-    path, record = tmp_path_factory.mktemp("log") / "log.csv", recipe("record_log")
-    states = {"states": ("rotor_speed",), "horizon": 30.0, "gap": 0.1}
-    record.main(record.Config(log=path, plant="wind_turbine", **states))
-    table = pd.read_csv(path)
-    table["rpm"], table["ms"] = table.pop("rotor_speed") * 30.0 / np.pi, 1e3 * table.pop("time")
-    table.to_csv(path, index=False)
-    return path
-
-
-COLUMNS = ("rpm=rotor_speed[rpm]", "ms=time*1e-3")
-
-
 def test_results_of_a_training_or_an_identification_are_not_overwritten(tmp_path):
     config = recipe("identify").Config(log=tmp_path / "log.csv", plant="wind_turbine", log_dir=tmp_path)
     for name in ("weights.pt", "metrics.json"):
@@ -226,22 +210,3 @@ def test_results_of_a_training_or_an_identification_are_not_overwritten(tmp_path
         with pytest.raises(ValueError, match=rf"log_dir={tmp_path} holds results already.*{name}.*another folder"):
             config.make_folder("wind_turbine")
         assert (tmp_path / name).read_text() == "kept" and not (tmp_path / "figures").exists()
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"columns": ()}, "no column 'time'"),
-        ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
-        ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
-        ({"dt": 60.0}, "unstable"),
-        ({"plant": "rt_torchrl:Signal"}, "rt_torchrl does not exist; give a file with Python code"),
-        ({"log_dir": Path("")}, "log_dir='' is the current folder"),
-    ],
-)
-def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
-    identify = recipe("identify")
-    given = {"log": log, "plant": "wind_turbine", "columns": COLUMNS, "log_dir": tmp_path} | options
-    with pytest.raises(ValueError, match=message):
-        identify.main(identify.Config(**given))
-    assert not list(tmp_path.iterdir())

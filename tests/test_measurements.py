@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import Constant, LinearQuadratic
-from seeds_and_numbers import double, seeded
+from seeds_and_numbers import double, drawn, seeded
 from test_export_recipe import RECIPES
 
 import rt_torchrl as rt
@@ -140,9 +140,9 @@ SEEN = {"wind_turbine": (), "flapping_wing": ("--observe", "position+wind"), "cr
 def test_policies_of_some_sensors_see_nothing_else(name):
     """No change of another state, which no controller holds, changes the observation."""
     config = from_command_line(load_recipe(RECIPES / f"{name}.py").Config, SEEN[name])
-    plant, generator = config.plant(), torch.Generator().manual_seed(0)
-    state, time = plant.draw_initial_state(1, generator), torch.zeros(1).double()
-    exogenous = plant.draw_exogenous(1, generator)[:, 0]
+    plant, time = config.plant(), torch.zeros(1).double()
+    state, exogenous = drawn(plant)
+    exogenous = exogenous[:, 0]
     seen = plant.observe(time, state, exogenous)
     for k, signal in enumerate(plant.states):
         if signal.name not in (*SENSORS[name], *plant.controller_states):

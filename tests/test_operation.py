@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import math
 import multiprocessing
-import os
 from functools import partial
 
 import pytest
@@ -17,7 +16,6 @@ from test_classical import PD
 from test_faults import require_true
 
 import rt_torchrl as rt
-from rt_torchrl.runs.real_side import learner_threads
 from rt_torchrl.steps.switch import Imitation
 from rt_torchrl.systems import operation as module
 from rt_torchrl.systems.config import OperatingLimitsConfig, OperationConfig, SafetyConfig
@@ -167,28 +165,6 @@ def test_a_reading_refused_at_the_end_of_a_window_is_not_the_start_of_the_next()
     assert stored == [30, 59, 88]
 
 
-def unreachable(fails):
-    """A system that fails in one of its resets, which are counted from 1."""
-    system, resets = Stepped(PLANT), itertools.count(1)
-    reset = system._reset
-
-    def failing(*args, **options):
-        if next(resets) == fails:
-            raise ConnectionError("no answer")
-        return reset(*args, **options)
-
-    system._reset = failing
-    return system
-
-
-def test_a_reset_that_fails_is_tried_again():
-    found = twinning(lambda *parts: InProcess(*parts, unreachable(3)), PLANT)
-    reports = [found.episode() for _ in range(4)]
-    assert reports[2]["episodes_refused"] == 1
-    assert "failed in its reset: ConnectionError: no answer" in reports[2]["refusal"]
-    assert [fault.kind for fault in found.flights.faults] == [] and reports[3]["windows"] == 1
-
-
 # An operation in a process of its own, with true clocks, and whole runs of it.
 
 
@@ -211,13 +187,6 @@ def operation(make_env, **options):
         yield found, policies["two"]
     finally:
         found.close()
-
-
-def test_the_learner_leaves_a_core_to_what_acts(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    for options, expected in ({}, 0), ({"asynchronous": True}, 2), ({"asynchronous": True, "threads": 7}, 7):
-        assert learner_threads(rt.RunConfig(**options)) == expected
 
 
 @pytest.mark.slow

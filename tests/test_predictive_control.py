@@ -285,8 +285,9 @@ def by_rollout(plant, plan, state, exogenous, *, hold=1, start=0.0, penalty=PENA
 @pytest.mark.parametrize("hold, n", [(1, 12), (4, 9)])
 @pytest.mark.parametrize("kind", [WindTurbine, LinearQuadratic, Untraceable])
 def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
-    plant, generator = kind(), torch.Generator().manual_seed(3)
-    states, inputs = plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)[:, :n]
+    plant = kind()
+    states, inputs = drawn(plant, 3, 3)
+    inputs = inputs[:, :n]
     cost = CommandCost(plant, constant(plant.closure), n, hold=hold)
     assert cost.shape == (-(-n // hold), len(plant.actions))
     plan = np.random.default_rng(0).random(cost.shape)

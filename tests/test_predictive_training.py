@@ -1,17 +1,15 @@
 """Model predictive control in the place of the model-based policy, in the whole method and in the recipes."""
 
 import dataclasses
-import json
 
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import FULL, SMALL
 from test_algorithm import flown
-from test_export_recipe import RECIPES, recipe
+from test_export_recipe import recipe
 
 from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
-from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.config import ROLES
 from rt_torchrl.steps.switch import Imitation, clones
 
@@ -98,31 +96,3 @@ def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path, monkeypatch)
             export.main(export.Config(run=tmp_path, what=(what,), formats=("c",)))
     export.main(export.Config(run=tmp_path, role="model_free"))
     assert (tmp_path / "exported" / "linear_quadratic_model_free.c").is_file()
-
-
-ALWAYS = (
-    "--quick --no-figures --threads 1 --twinning.planner.method receding_horizon --twinning.arm model_based "
-    "--twinning.learner.return-steps 1"
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, options",
-    [
-        ("wind_turbine", "--horizon 20 --policy scheduled"),
-        (
-            "flapping_wing",
-            "--horizon 0.2 --twinning.planner.receding-horizon.horizon 1 --observe phase --noise 0.001",
-        ),
-        ("cryogenic_tank", "--horizon 7200 --command duty"),
-    ],
-)
-def test_recipes_take_it_with_other_options(tmp_path, name, options):
-    module = load_recipe(RECIPES / f"{name}.py")
-    words = [*ALWAYS.split(), "--log-dir", str(tmp_path / "run"), *options.split()]
-    module.main(from_command_line(module.Config, words))
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["episodes"]
-    assert len(found) == 3 and all(record["diverged_solves"] == 0.0 < record["solve_median"] for record in found)
-    if name == "wind_turbine":
-        assert all(record["real_cost"] < 0.5 for record in found), [record["real_cost"] for record in found]

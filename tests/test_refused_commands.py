@@ -155,30 +155,6 @@ def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error
     system.close()
 
 
-def test_a_client_that_cannot_be_made_now_is_a_lost_connection_and_is_made_at_the_next_attempt(server):
-    """To make a client may ask the server, for its certificate for instance, and that takes longer than an answer."""
-    from asyncua.sync import Client
-
-    failures = [ConnectionRefusedError("nobody listens"), server.ua.UaError("no such policy"), TimeoutError()]
-
-    def client(tloop):
-        if failures:
-            raise failures.pop(0)
-        tloop.post(asyncio.sleep(0.3))
-        return Client(server.url, tloop=tloop)
-
-    link = OpcUaLink(client, {"position": "ns=2;s=position"}, {"double": "ns=2;s=double"}, timeout=0.2)
-    for kind in ("ConnectionRefusedError: nobody listens", "UaError: no such policy", "TimeoutError"):
-        with pytest.raises(LinkLostError, match=kind):
-            link.connect()
-    try:
-        for _ in range(2):
-            link.connect()
-            assert link.read() == {"position": 0.5}
-    finally:
-        link.close()
-
-
 def test_an_error_of_the_link_beside_the_control_loop_is_raised_in_it_and_the_next_reset_connects():
     line = Line(Time(), 0.1, fails={("write", 1): LinkLostError("cut"), ("connect", 2): KeyError("cert.pem")})
     env = client_of(line)

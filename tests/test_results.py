@@ -184,8 +184,6 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     for segment, where in ((0, "its last records"), (22, "segments of 22 intervals")):
         found = {"rms": rms, "segment": segment, "noise": {}, "standard_errors": {}}
         assert results.fit_lines(found) == [f"  twin over {where}: {line}"]
-    told = results.fit_lines(found | {"noise": {"rotor_speed [rad/s]": 0.01}})[-1]
-    assert told == "  noise of the sensors: RMS rotor_speed 0.01 rad/s"
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"} | {f"rms/{name}": rms[name] for name in rms}
     assert progress_line(record) == f"{line}, real 0.5, live model-free"
 

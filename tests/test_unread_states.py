@@ -18,8 +18,6 @@ from test_real_system import Rig, connected
 
 import rt_torchrl as rt
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.rosco import Answer
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.fit.log import SensorLog
 from rt_torchrl.fit.resampling import resample
@@ -253,21 +251,6 @@ def test_a_real_system_that_reports_the_states_of_the_plant_alone():
         seen = torch.stack(seen, 1)
         torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
         assert found["done"].all()
-
-
-def test_roscos_simulator_remembers_past_observations():
-    plant = rt.StackedObservations(WindTurbine(horizon=4.0), 2)
-    start, wind, seen = plant.draw_initial_state(1, seeded())[0], 11.0 + 0.1 * torch.arange(8.0), []
-
-    def decide(state, speed, report):
-        seen.append(plant.observe(state.new_tensor(plant.dt * len(seen)), state, state.new_tensor([speed])))
-        return plant.actuate(state, state.new_tensor([3e4, 1.0]))
-
-    answer = Answer(plant, start, wind.numpy(), decide, 5)
-    for step in range(40):
-        answer.call_controller({"rot_speed": 1.0 + 0.002 * step, "ws": 11.0})
-    seen = torch.stack(seen)[None]
-    torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=0.0, atol=0.0)
 
 
 def test_past_observations_are_what_sensors_read_then():
