@@ -27,7 +27,9 @@ def guarded(*injections, plant=None, **options):
     moving = (3, *[0] * (len(plant.readings) - 1))
     watched = {"ranges": {"state": (-1e8, 1e8)}, "frozen": {"state": moving}, "deadline": 0.5}
     middle = tuple(0.5 * (action.low + action.high) for action in plant.actions)
-    return SafetyLayer(system, SafetyConfig(interval=plant.dt, **watched | options), fallback=middle, clock=wait)
+    made = SafetyLayer(system, SafetyConfig(interval=plant.dt, **watched | options), fallback=middle)
+    made.clock = wait
+    return made
 
 
 def algorithm(env, **changes):

@@ -39,7 +39,9 @@ class Failing(PlantEnv):
 
 def layer(env=None, *, fallback=(0.0,), clock=None, horizon=2.0, **options):
     env = PlantEnv(LinearQuadratic(horizon=horizon), seed=0) if env is None else env
-    return SafetyLayer(env, SafetyConfig(interval=DT, **options), fallback=fallback, clock=clock or Time())
+    made = SafetyLayer(env, SafetyConfig(interval=DT, **options), fallback=fallback)
+    made.clock = clock or Time()
+    return made
 
 
 def failing(clock=None, horizon=2.0, broken=(), late=(), value=float("nan"), **options):

@@ -88,10 +88,10 @@ class Line:
 
 
 def connected(line, entries=ENTRIES, **options):
-    times = {"period": line.period, "clock": line.time, "sleep": line.time.sleep}
-    return rt.ConnectedPlant(
-        line, entries, COMMANDS, PLANT.actions, **times, sample="sample", answered="answered", **options
-    )
+    named = {"sample": "sample", "answered": "answered"}
+    env = rt.ConnectedPlant(line, entries, COMMANDS, PLANT.actions, period=line.period, **named, **options)
+    env.pace.clock, env.pace.sleep = line.time, line.time.sleep
+    return env
 
 
 def test_a_client_answers_every_sample_of_the_plant():

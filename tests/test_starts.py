@@ -123,14 +123,10 @@ class Cubic(LinearClosure):
 def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
     speed = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
     for changed, options, message in (
-        ({"name": "other"}, {}, "is a run of plant 'linear_quadratic', this run is of plant 'other'"),
-        ({"observations": speed}, {}, "whose observations are .*velocity_error"),
+        ({"name": "other"}, {}, "whose name is linear_quadratic; here it is other"),
+        ({"observations": speed}, {}, "whose observations is .*velocity_error"),
         ({}, {"closure": "mlp"}, r"whose closure does not fit that of this run"),
-        (
-            {"make_closure": lambda self, generator: Cubic(self.true_closure)},
-            {},
-            "LinearClosure; that of this run is a Cubic",
-        ),
+        ({"make_closure": lambda self, generator: Cubic(self.true_closure)}, {}, "is LinearClosure; here it is Cubic"),
     ):
         plant = type("Other", (LinearQuadratic,), changed)(horizon=2.0, noise=0.1)
         with pytest.raises(ValueError, match=message):

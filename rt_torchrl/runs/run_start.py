@@ -14,7 +14,6 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
 from rt_torchrl.runs.run_folder import checkpoints
-from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.steps.config import ROLES
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
@@ -58,25 +57,20 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
 
 
 def _of_run(folder: Path, config: RunConfig, plant: Plant) -> EarlierPolicies:
-    where = f"start={str(folder)!r} is a run"
-    name = read_settings(folder)["plant"]
-    if name != plant.name:
-        raise ValueError(f"{where} of plant {name!r}, this run is of plant {plant.name!r}.")
-    kind = type(config)
+    where, kind = f"start={str(folder)!r} is a run", type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
-    for what in ("observations", "actions"):
-        earlier, present = getattr(run.physics, what), getattr(plant, what)
+    closure, hypotheses = config.make_closure(plant, torch.Generator()), None
+    compared = {
+        what: (getattr(run.physics, what), getattr(plant, what)) for what in ("name", "observations", "actions")
+    }
+    # Weights of the same shapes may be those of another law.
+    compared["closure"] = type(run.closure).__name__, type(closure).__name__
+    for what, (earlier, present) in compared.items():
         if earlier != present:
             raise ValueError(
-                f"{where} whose {what} are {', '.join(map(str, earlier))}; here they are "
-                f"{', '.join(map(str, present))}. Give the options of that run, such as --observe, or another start."
+                f"{where} whose {what} is {earlier}; here it is {present}. Give the options of that run, such as "
+                "--observe or --closure, or another start."
             )
-    closure, hypotheses = config.make_closure(plant, torch.Generator()), None
-    kinds = [type(module).__name__ for module in (run.closure, closure)]
-    if kinds[0] != kinds[1]:  # weights of the same shapes may be those of another law
-        raise ValueError(
-            f"{where} whose closure is a {kinds[0]}; that of this run is a {kinds[1]}; give its --closure."
-        )
     try:
         closure.load_state_dict(run.closure.state_dict())
         twin = make_twin(plant, closure, config.twinning.hypotheses)

@@ -100,23 +100,20 @@ class Pace:
 
     Args:
         period: time from one beginning to the next [s].
-        clock: wall clock [s].
-        sleep: function that waits for some time [s].
 
     Raises:
         ValueError: if the period is not positive.
     """
 
-    def __init__(
-        self,
-        period: float,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
+    clock = staticmethod(time.monotonic)
+    """Wall clock [s]."""
+    sleep = staticmethod(time.sleep)
+    """Waits for some time [s]."""
+
+    def __init__(self, period: float):
         if not period > 0.0:
             raise ValueError(f"period={period} s of a control loop must be positive.")
-        self.period, self._clock, self._sleep = period, clock, sleep
+        self.period = period
         self._due: float | None
         self.begin()
 
@@ -126,16 +123,16 @@ class Pace:
 
     def shift(self, seconds: float | None) -> None:
         """Move all intervals to come by some time [s]; with None the present moment is when this one was due."""
-        now = self._clock()
+        now = self.clock()
         self._due = now if seconds is None or self._due is None else self._due + seconds
 
     def wait(self) -> float:
         """Wait until the next interval is due; by how much it begins late [s]."""
-        now = self._clock()
+        now = self.clock()
         due = now if self._due is None else self._due + self.period
         if due > now:
-            self._sleep(due - now)
-            now = self._clock()
+            self.sleep(due - now)
+            now = self.clock()
         self.late = now - due
         self._due = now if self.late >= self.period else due
         return self.late

@@ -221,7 +221,6 @@ class SafetyLayer(AroundSystem):
         fallback: action within the range; a function that makes an action from the TensorDict of the last observation;
             or state feedback, where ``state`` and ``exogenous`` are observed. It is asked in every interval, so that
             its memory goes on while the policy acts and its action is not used.
-        clock: wall clock [s].
 
     Raises:
         ValueError: if there is more than one system or action entry, the action is not continuous, the interval is not
@@ -229,14 +228,10 @@ class SafetyLayer(AroundSystem):
             their range.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        config: SafetyConfig,
-        *,
-        fallback: Fallback,
-        clock: Callable[[], float] = time.monotonic,
-    ):
+    clock = staticmethod(time.monotonic)
+    """Wall clock [s]."""
+
+    def __init__(self, env: EnvBase, config: SafetyConfig, *, fallback: Fallback):
         if env.batch_size.numel() != 1:
             raise ValueError(f"env has batch_size={tuple(env.batch_size)}; a safety layer guards one system.")
         if list(env.action_keys) != ["action"] or not env.action_spec.dtype.is_floating_point:
@@ -251,7 +246,7 @@ class SafetyLayer(AroundSystem):
                 f"check its unit: {other_units('s')}."
             )
         super().__init__(device=env.device, batch_size=env.batch_size)
-        self.env, self.config, self._clock = env, config, clock
+        self.env, self.config = env, config
         self.report, self._episodes = SafetyReport(), 0
         """Report of the present episode; between two episodes, that of the last one."""
         self._good: dict[str, Tensor] = {}
@@ -308,10 +303,10 @@ class SafetyLayer(AroundSystem):
         past = self._passed + self._step_count
         t, end = (self.config.interval * k for k in (past, past + 1))
         applied, reasons = self._chosen(t, tensordict)
-        start = self._clock()
+        start = self.clock()
         sent = tensordict.exclude("next", "tripped", "refused").set("action", applied.clone())
         reading = self.env.step(sent)["next"]
-        faults = self._faults(reading, self._clock() - start)
+        faults = self._faults(reading, self.clock() - start)
         self.watchdog.note(end, bool(faults))
         reading = self._remember(reading.copy())
         if "applied" not in self.env.full_observation_spec:

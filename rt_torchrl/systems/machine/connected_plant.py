@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Protocol, runtime_checkable
 
@@ -110,8 +110,6 @@ class ConnectedPlant(ForeignSystem):
         period: control period of the plant [s].
         sample: tag that counts the samples; None if the plant has none, and then the client's own clock counts.
         answered: tag that takes the number of the sample that a command answers; None if the plant has none.
-        clock: wall clock [s].
-        sleep: function that waits for some time [s].
 
     Raises:
         ValueError: if there are no entries, or not one command for each action, or a time is not positive, or a number
@@ -129,8 +127,6 @@ class ConnectedPlant(ForeignSystem):
         period: float,
         sample: str | None = None,
         answered: str | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
     ):
         if not entries or not actions or len(commands) != len(actions):
             raise ValueError(
@@ -140,10 +136,9 @@ class ConnectedPlant(ForeignSystem):
         if answered is not None and sample is None:
             raise ValueError(f"answered={answered!r} takes the number of a sample; name the tag that counts, sample.")
         super().__init__({key: len(tags) for key, tags in entries.items()} | {"skipped": 1}, actions)
-        self.link, self.pace = link, Pace(period, clock=clock, sleep=sleep)
+        self.link, self.pace = link, Pace(period)
         self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
         self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
-        self._clock, self._sleep = clock, sleep
         self.reads_applied = "applied" in entries
         """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
         self.losses = self._in_a_row = self._gap = 0
@@ -154,8 +149,8 @@ class ConnectedPlant(ForeignSystem):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Connect, if there is no connection, and wait for a sample."""
-        until = self._clock() + PATIENCE
-        while self._clock() < until:
+        until = self.pace.clock() + PATIENCE
+        while self.pace.clock() < until:
             try:
                 if not self._up() and self._connecting is None:
                     self.link.connect()
@@ -167,7 +162,7 @@ class ConnectedPlant(ForeignSystem):
                     return self._entries(reading)
             except LinkLostError as lost:
                 self._connected, self._lost = False, str(lost)
-            self._sleep(min(AGAIN, self.pace.period))
+            self.pace.sleep(min(AGAIN, self.pace.period))
         raise ValueError(f"the plant has not answered for {PATIENCE:g} s: {self._lost}")
 
     def _up(self) -> bool:
@@ -197,7 +192,7 @@ class ConnectedPlant(ForeignSystem):
 
     def _fresh(self) -> dict[str, float] | None:
         """A reading newer than the last one; None if none comes in time."""
-        until, looks = self._clock() + FRESH * self.pace.period, 0
+        until, looks = self.pace.clock() + FRESH * self.pace.period, 0
         try:
             while True:
                 reading = self.link.read()
@@ -208,11 +203,11 @@ class ConnectedPlant(ForeignSystem):
                 if math.isfinite(sample) and sample != self._sample:
                     break
                 looks += 1
-                if self._clock() >= until:
+                if self.pace.clock() >= until:
                     why = self.link.quality.get(self._sample_tag, "it was read before")
                     self.reasons = {"all tags": f"{self._sample_tag} = {sample:.0f} is no new sample: {why}"}
                     return None
-                self._sleep(self.pace.period / LOOKS)
+                self.pace.sleep(self.pace.period / LOOKS)
         except LinkLostError as error:
             self._lose(error)
             self.reasons = {"all tags": self._lost}
