@@ -272,21 +272,18 @@ def known(path: Path) -> dict[str, Any] | None:
 
 
 def in_a_worker(file: str, kind: str, task: dict[str, Any]) -> str | None:
-    """Run a task of this file in another process, which imports the file: what a script defines has no name there."""
+    """Run a task of this file in another process, and return what went wrong; ``interrupted`` after Ctrl-C.
+
+    The process imports the file: what a script defines has no name there.
+    """
     from rt_torchrl.runs.settings import module_of
 
-    study = module_of(Path(file))
-    return study.failure_of(getattr(study, kind)(**task))
-
-
-def failure_of(task: Training | Search) -> str | None:
-    """Run a task and return what went wrong; ``interrupted`` after Ctrl-C."""
     try:
-        task.run()
+        getattr(module_of(Path(file)), kind)(**task).run()
     except (Interrupted, KeyboardInterrupt):
         return "interrupted"
     except (Exception, SystemExit) as error:
-        return f"{getattr(task, 'folder', task.words)}: {type(error).__name__}: {error}"
+        return f"{task.get('folder', task['words'])}: {type(error).__name__}: {error}"
     return None
 
 
@@ -338,10 +335,12 @@ def overview(comparisons: Sequence[rt.Comparison], key: str) -> str:
     first = comparisons[0].rows[0].name
     numbers = {table.title: table.numbers()["rows"] for table in comparisons if table.rows[0].name == first}
     arms = list(dict.fromkeys(arm for rows in numbers.values() for arm in rows))[1:]
-    lines = [[system, *(with_interval(rows.get(arm, {}).get(key)) for arm in arms)] for system, rows in numbers.items()]
-    ratios = [[rows[arm][key]["ratio"] for rows in numbers.values() if rows.get(arm, {}).get(key)] for arm in arms]
-    means = [f"{statistics.geometric_mean(of_arm):.3f} ({len(of_arm)})" if of_arm else "" for of_arm in ratios]
-    return markdown(["", *arms], [*lines, ["geometric mean (systems)", *means]])
+    lines = [
+        (system, {arm: with_interval(rows.get(arm, {}).get(key)) for arm in arms}) for system, rows in numbers.items()
+    ]
+    ratios = {arm: [rows[arm][key]["ratio"] for rows in numbers.values() if rows.get(arm, {}).get(key)] for arm in arms}
+    means = {arm: f"{statistics.geometric_mean(of):.3f} ({len(of)})" if of else "" for arm, of in ratios.items()}
+    return markdown([*lines, ("geometric mean (systems)", means)])
 
 
 def write(config: Config, comparisons: Sequence[rt.Comparison]) -> str:

@@ -3,7 +3,7 @@
 import json
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,40 +191,31 @@ class Comparison:
 
     def table(self) -> str:
         """The statistics and, below them, the plant's own quantities, as two Markdown tables."""
-        first = self.rows[0].name
-        header = ["", "seeds", "J_a", "over the optimum", f"J_a over {first}", "Σ J_a"]
-        header += [f"Σ over {first}", "episodes to 110 %", "alarms", "seconds"]
-        lines, merits = [], {}
+        first, controllers = self.rows[0].name, self.rows[0].runs[0].controllers
+        lines, merits = list[tuple[str, dict[str, str]]](), list[tuple[str, dict[str, float]]]()
         for name, row in self.numbers()["rows"].items():
-            lines.append(
-                [
-                    name,
-                    str(len(row["seeds"])),
-                    with_range(row["J_a"]),
-                    above(row["J_a"]["median"], row["optimum"]),
-                    with_interval(row["J_a_ratio"]),
-                    with_range(row["paid"]),
-                    with_interval(row["paid_ratio"]),
-                    with_range(row["episodes_to_optimum"]).replace("inf", "never"),
-                    with_range(row["alarms"]),
-                    with_range(row["seconds"]),
-                ]
-            )
-            merits[name] = row["merit"]
-        known = {name: cost for name, (cost, _) in self.rows[0].runs[0].controllers.items()}
-        merits |= {name: merit for name, (_, merit) in self.rows[0].runs[0].controllers.items()}
-        known |= {f"optimum ({row.name})": row.optimum for row in self.rows if row.optimum is not None}
-        lines += [[name, "", f"{cost:.4g}", *[""] * (len(header) - 3)] for name, cost in known.items()]
-        kept = [k for k in range(len(header)) if k < 3 or any(line[k] for line in lines)]
-        tables = [markdown([header[k] for k in kept], [[line[k] for k in kept] for line in lines])]
-        # Runs with limits of states have some that others have not.
-        if quantities := list(dict.fromkeys(quantity for merit in merits.values() for quantity in merit)):
-            rows = [
-                [name, *(f"{merit[quantity]:.4g}" if quantity in merit else "" for quantity in quantities)]
-                for name, merit in merits.items()
-            ]
-            tables.append(markdown(["", *quantities], rows))
-        return "\n\n".join(tables)
+            cells = {
+                "seeds": str(len(row["seeds"])),
+                "J_a": with_range(row["J_a"]),
+                "over the optimum": above(row["J_a"]["median"], row["optimum"]),
+                f"J_a over {first}": with_interval(row["J_a_ratio"]),
+                "Σ J_a": with_range(row["paid"]),
+                f"Σ over {first}": with_interval(row["paid_ratio"]),
+                "episodes to 110 %": with_range(row["episodes_to_optimum"]).replace("inf", "never"),
+                "alarms": with_range(row["alarms"]),
+                "seconds": with_range(row["seconds"]),
+            }
+            lines.append((name, cells))
+            merits.append((name, row["merit"]))
+        optima = [(f"optimum ({row.name})", row.optimum) for row in self.rows if row.optimum is not None]
+        known = [(name, cost) for name, (cost, _) in controllers.items()] + optima
+        lines += [(name, {"J_a": f"{cost:.4g}"}) for name, cost in known]
+        merits += [(name, merit) for name, (_, merit) in controllers.items()]
+        # Runs with limits of states have quantities that others have not.
+        quantities = [(name, {quantity: f"{x:.4g}" for quantity, x in merit.items()}) for name, merit in merits]
+        return "\n\n".join(
+            [markdown(lines), *([markdown(quantities)] if any(cells for _, cells in quantities) else [])]
+        )
 
 
 def compare_runs(folders: Iterable[Path | str]) -> Comparison:
@@ -307,9 +298,12 @@ def with_interval(ratio: dict[str, float | None] | None) -> str:
     return f"{texts[0]} [{texts[1]}, {texts[2]}]"
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
+def markdown(rows: Sequence[tuple[str, Mapping[str, str]]]) -> str:
+    """A Markdown table of rows with a name and cells by column; a column whose cells are all empty is left out."""
+    columns = dict.fromkeys(column for _, cells in rows for column in cells)
+    shown = [column for column in columns if any(cells.get(column) for _, cells in rows)]
+    lines = [[name, *(cells.get(column, "") for column in shown)] for name, cells in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (["", *shown], ["---"] * (len(shown) + 1), *lines))
 
 
 def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure":
