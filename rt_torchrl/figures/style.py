@@ -163,14 +163,10 @@ def logarithmic_if_wide(ax: Axes, least_range: float = WIDE_RANGE) -> None:
     if values.size and values.min() > 0.0 and values.max() >= least_range * values.min():
         ax.set_yscale("log")
         if values.max() < 1000.0 * values.min():
-            plain_numbers(ax)
-
-
-def plain_numbers(ax: Axes) -> None:
-    """Write 1, 2 and 5 of each decade on a logarithmic axis, as plain numbers."""
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+            # Plain numbers 1, 2 and 5 of each decade.
+            ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:

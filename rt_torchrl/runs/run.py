@@ -28,7 +28,7 @@ from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress
 from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
-from rt_torchrl.runs.run_folder import RunFolder, load_checkpoint, save_checkpoint, save_tensors
+from rt_torchrl.runs.run_folder import RunFolder, checkpoints, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of
 from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.steps.config import ROLES, Role
@@ -133,7 +133,7 @@ class Run:
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
             self._doubts: tuple[str, ...] = ()
-            if self._held.resumes():
+            if config.resume and checkpoints(self.folder):
                 self._paid = real_side.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
                 self.started -= sum(results.seconds_per_step(self.episodes).values())
@@ -324,7 +324,7 @@ class Run:
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        entry = real_side.entries(episodes.plant, flights, judged, live)
+        entry = real_side.entries(flights, judged, live)
         self._paid += [cost for costs in entry["costs"].values() for cost in costs]
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])

@@ -205,10 +205,6 @@ class RunFolder:
         if not holds_run or (finished and not checkpoints(self.path)):
             raise ValueError(f"log_dir={self.path} holds no run to resume: it needs {FILE} and a checkpoint. {ANEW}")
 
-    def resumes(self) -> bool:
-        """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        return self._config.resume and bool(checkpoints(self.path))
-
     def begin(self, effective: RunConfig) -> None:
         """Write ``config.json``.
 

@@ -126,8 +126,8 @@ class Pace:
         now = self.clock()
         self._due = now if seconds is None or self._due is None else self._due + seconds
 
-    def wait(self) -> float:
-        """Wait until the next interval is due; by how much it begins late [s]."""
+    def wait(self) -> None:
+        """Wait until the next interval is due."""
         now = self.clock()
         due = now if self._due is None else self._due + self.period
         if due > now:
@@ -135,7 +135,6 @@ class Pace:
             now = self.clock()
         self.late = now - due
         self._due = now if self.late >= self.period else due
-        return self.late
 
 
 @dataclass
@@ -341,14 +340,21 @@ class Operation:
 
         Raises:
             EpisodeEndedError: if the system failed in that window, or ended it; it holds the intervals before.
+            RuntimeError: if the acting process has failed or ended.
         """
         connection = self._begun()
         while not connection.poll(LOOK):
             safe_point()
-        window, self._state = self._received(connection)
-        assert self._state is not None
-        self.system.load_state_dict(self._state["env"])
-        return self._take(window, self._state["order"]["version"])
+        try:
+            kind, *parts = pickle.loads(connection.recv_bytes())
+        except (EOFError, OSError) as error:
+            raise RuntimeError("the acting process has ended without a word; it may have been killed.") from error
+        if kind == "failed":
+            raise RuntimeError(f"the acting process has failed: {parts[0]}")
+        window, state = parts
+        self._state = state
+        self.system.load_state_dict(state["env"])
+        return self._take(window, state["order"]["version"])
 
     def _take(self, window: Window, acting: int) -> TensorDict:
         """The control intervals of a window, where it is a whole one.
@@ -364,16 +370,6 @@ class Operation:
         if window.ended is not None or entries is None:
             raise EpisodeEndedError(window.ended or "the window holds no interval", entries)
         return cast(TensorDict, entries)
-
-    def _received(self, connection: Connection) -> list[Any]:
-        """The next window of the acting process, and its state; an error where it has failed or ended."""
-        try:
-            kind, *parts = pickle.loads(connection.recv_bytes())
-        except (EOFError, OSError) as error:
-            raise RuntimeError("the acting process has ended without a word; it may have been killed.") from error
-        if kind == "failed":
-            raise RuntimeError(f"the acting process has failed: {parts[0]}")
-        return parts
 
     def close(self) -> None:
         """End the operation; the system gets its safe action from whatever stands behind it."""
