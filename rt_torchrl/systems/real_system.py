@@ -232,7 +232,7 @@ class RealSystem(EnvBase):
             )
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
-            raise ValueError(f"key={key!r} of the actuation is none of the environment's, {self.env.action_keys}.")
+            raise ValueError(f"key={key!r} of the actuation is no action; choose of {self.env.action_keys}.")
         spec = self.env.full_action_spec[key]
         if not isinstance(spec, Bounded | Unbounded) or spec.shape[len(self.env.batch_size) :].numel() != len(names):
             raise ValueError(f"the environment's action is {spec}; the plant needs continuous ones for {names}.")
