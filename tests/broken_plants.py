@@ -100,16 +100,8 @@ for message, overrides in (
         changed("make_policy", lambda _: Bounded(Rows(nn.BatchNorm1d(2), nn.Linear(2, 1)))),
     ),
     (
-        rf"make_policy: .* {AGAIN}.*\.eval\(\)",
-        changed("make_policy", lambda _: Bounded(Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)))),
-    ),
-    (
         "make_policy: its derivative by state 'position' is 0, by finite differences .*the path is cut",
         changed("make_policy", lambda _: Bounded(Cut(2, 1, dtype=torch.float64))),
-    ),
-    (
-        f"make_neural_closure: .* {AGAIN}",
-        {"make_neural_closure": lambda self, generator, hidden: Bounded(Recurrent(outputs=2))},
     ),
     (
         "make_neural_closure: raised RuntimeError .*shapes cannot be multiplied",

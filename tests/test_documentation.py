@@ -11,16 +11,14 @@ from pathlib import Path
 
 import fresh_process
 import pytest
-import torch
 from printed_commands import ROOT, TEXTS, blocks, run_code
 from tensordict import TensorDict
 from test_export_recipe import RECIPES, leave_run
 
 import rt_torchrl
-from rt_torchrl import AssimilationConfig, HypothesesConfig, Rollout, Trajectory, check_plant
+from rt_torchrl import HypothesesConfig
 from rt_torchrl.atomic_file import write_json
 from rt_torchrl.steps.config import ROLES
-from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
 
 RUN_HERE = "README finished_run gallery habits hypotheses own_plant unknown_systems".split()
@@ -74,23 +72,6 @@ def test_the_suspects_of_the_tutorial_plant_are_plants():
     tank = scope["SuspiciousTank"]()
     twin = make_twin(tank, tank.closure, HypothesesConfig(which=("unknown flow", "pump lags")))
     assert set(twin.twins) == {ALONE, "unknown flow", "pump lags"}
-
-
-def test_the_extension_of_the_documentation_finds_a_leak():
-    scope = tutorial_with_suspects()
-    real, tank = scope["Leak"](scope["TwoTanks"](), 4e-3), scope["LeakyTank"]()
-    check_plant(tank.suspects()["leaks"], steps=10, traced=False)
-    generator = torch.Generator().manual_seed(0)
-    commands = 2e-4 * torch.rand(1, tank.n_steps, 1, generator=generator, dtype=torch.float64)
-    drawn = real.draw_initial_state(1, generator), real.draw_exogenous(1, generator)
-    record = [part[0] for part in Rollout(real, real.closure)(*drawn, commands)[:3]]
-    config = HypothesesConfig(call=0.0, which=("leaks", "pump lags"))
-    twin = make_twin(tank, tank.make_closure(generator), config)
-    fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
-    EnsembleAssimilation(twin, fit, config).update([Trajectory(*record)])
-    found = twin.twins["leaks"].closure.named_coefficients()
-    assert twin.weights == {"leaks": 1.0} and found["leak"].item() == pytest.approx(4e-3, rel=1e-3)
-    assert found["lower_outlet"].item() == pytest.approx(4e-5, rel=1e-2)
 
 
 def test_the_real_turbine_has_what_its_twin_does_not_know():

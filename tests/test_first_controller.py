@@ -118,17 +118,6 @@ def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
     assert found.belief.beside_first(found.model_based, found.first.teacher) == pytest.approx((corrected, paid))
 
 
-def test_a_twin_that_overstates_costs_refuses_no_clone_of_the_controller():
-    found, record = started()
-    with torch.no_grad():
-        found.twin.closure.matrix.copy_(torch.tensor([[0.0, 0.0], [1.5, 1.0]]))
-        found.model_based.gain.copy_(torch.tensor([GAINS]))
-    teacher = found.first.teacher
-    expected, paid = found.belief.beside_first(found.model_based, teacher)
-    assert found.virtual.cost(teacher, found.virtual.repeated(record)) > 2.0 * paid
-    assert expected == pytest.approx(paid, rel=1e-3)
-
-
 def test_a_controller_whose_costs_have_no_ratio_is_named():
     found, record = started()
     with pytest.raises(ValueError, match=r"J_a=-1 of a real episode of plant .* is negative"):

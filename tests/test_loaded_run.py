@@ -3,20 +3,17 @@
 import dataclasses
 import json
 import runpy
-import shutil
 import sys
 import typing
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import drawn, stepped
 from small_runs import SMALL, small_run
 from test_documentation import leave_finished_run
-from test_early_ends import Falling
 from test_export_recipe import RECIPES, leave_run, leave_run_of, recipe
 from test_hypotheses import Suspecting
-from test_predictive_control import Undisturbed
 
 from rt_torchrl import HypothesesConfig, RunConfig, SaturatedMLP, load_run
 from rt_torchrl.runs import settings as settings_module
@@ -234,15 +231,3 @@ def test_impossible_requests_are_refused(run):
     ):
         with pytest.raises(ValueError, match=message):
             run.simulate(policy, **arguments)
-
-
-@pytest.mark.parametrize("plant", [Undisturbed(horizon=2.0), Falling()])
-def test_figures_show_the_twin_of_a_plant_without_inputs_and_end_with_the_episode(run, plant, tmp_path):
-    leave_run_of(tmp_path, RunConfig(log_dir=tmp_path), plant)
-    shutil.copy(run.folder / "metrics.json", tmp_path)
-    loaded = load_run(tmp_path, plant=plant)
-    flown = loaded.simulate(LinearGain([[0.0, 0.0]]))
-    ended = plant.ended(flown.states).tolist()
-    drawn = {line.get_label(): line.get_ydata() for line in loaded.figure("states", flown).axes[0].lines}
-    last = ended.index(True) if any(ended) else plant.n_steps
-    assert "twin" in drawn and drawn["real"] == pytest.approx(flown.states[: last + 1, 0].numpy())

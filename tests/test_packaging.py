@@ -133,13 +133,6 @@ def test_type_checkers_and_people_see_the_same_names():
     assert sorted(listed) == sorted(HOMES) == sorted(rt_torchrl.__all__) == sorted(dir(rt_torchrl))
 
 
-def test_who_misspells_a_command_waits_for_nothing():
-    late, code = ("torch", "torchrl", "sklearn", "scipy", "matplotlib"), "import rt_torchrl; dir(rt_torchrl)"
-    code += "\nfrom rt_torchrl.runs.console import main; main([])"
-    done = python(f"{code}\nimport sys; print([name for name in {late} if name in sys.modules])")
-    assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
-
-
 READ = {"paper", "paper_figures"}
 """Recipes whose parts stand at the top, because they are read as much as run."""
 LATE = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem not in READ]

@@ -5,7 +5,6 @@ import importlib
 import re
 import sys
 from pathlib import Path
-from typing import Literal
 
 import pytest
 import torch
@@ -98,15 +97,6 @@ def test_an_option_that_a_recipe_declares_anew_keeps_what_its_base_allows():
         for read in (lambda given: Fewer(**given), lambda given: read_options(Fewer, given)):
             with pytest.raises(ValueError, match="must be"):
                 read(options)
-
-
-def test_a_class_that_checks_none_of_its_options_is_refused():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Unchecked(RunConfig):
-        law: Literal["affine", "cubic"] = "affine"
-
-    with pytest.raises(ValueError, match="the options of Unchecked are not checked; decorate it by @rt_torchrl.conf"):
-        Unchecked()
 
 
 # What a recipe's command line tells in one line instead of a traceback.

@@ -5,7 +5,6 @@ import itertools
 import json
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import study
@@ -253,17 +252,3 @@ def test_a_cluster_of_ray(tmp_path):
     finally:
         ray.shutdown()
     assert not failures and list(comparison.rows[0].costs) == [0, 1]
-
-
-def test_an_optimum_is_the_least_cost_of_a_policy_of_its_class(tmp_path):
-    """Model predictive control may cost less than the optimum of the class."""
-    trainings, searches = {}, {}
-    for arm, cost in (("single_start", 0.9), ("receding_horizon", 0.5)):
-        folder = leave(tmp_path / arm, seed=0, costs=[cost, cost], arm=arm)
-        config = study.options_of(TINY, ("--twinning.planner.method", arm))
-        training = SimpleNamespace(folder=folder, finished=lambda: True, config=lambda config=config: config)
-        trainings["tiny", arm] = [training]
-        searches["tiny", arm] = SimpleNamespace(path=tmp_path / "optimum.json")
-    (tmp_path / "optimum.json").write_text('{"J_a": 1.0}')
-    (found,) = study.comparisons_of(trainings, searches)
-    assert [row.optimum for row in found.rows] == [0.9] * 2

@@ -235,30 +235,6 @@ def test_they_are_machine_code_on_every_plant(kind, monkeypatch):
     torch.testing.assert_close(twin.sensitivities(*given)[1], whole)
 
 
-class Stiffness(nn.Module):
-    """p = (0, c s_1) with one number c, of no dimension."""
-
-    def __init__(self):
-        super().__init__()
-        self.c = nn.Parameter(torch.tensor(-0.2, dtype=torch.float64))
-
-    def forward(self, features):
-        return torch.stack([torch.zeros_like(features[..., 0]), self.c * features[..., 0]], -1)
-
-
-@pytest.mark.parametrize("native", [True, False])
-def test_a_weight_may_be_a_number_without_a_dimension(native, monkeypatch):
-    plant = LinearQuadratic(horizon=1.0)
-    twin, flown, exogenous = recorded(plant)
-    given = flown.states[:, 0], exogenous, flown.actions
-    own = DigitalTwin(plant, Stiffness())
-    twin.closure.load_state_dict({"matrix": torch.tensor([[0.0, 0.0], [-0.2, 0.0]]).double()})
-    if not native:
-        monkeypatch.setattr(own.sensitivities._engine, "native_end_states", lambda *given: None)
-    _, whole = twin.sensitivities(*given)  # by the four numbers of the matrix, of which the third is c
-    torch.testing.assert_close(own.sensitivities(*given)[1], whole[..., 2:3])
-
-
 class Solved(LinearQuadratic):
     """The oracle plant, whose rates solve equations M(s) ds/dt = M(s) f, as those of bodies with joints do."""
 
