@@ -104,18 +104,12 @@ class SensorLog:
 
     def __post_init__(self) -> None:
         t = self.times
-        if len(t) < 2 or not np.isfinite(t).all():
+        wrong = np.flatnonzero(~(np.diff(t, prepend=-np.inf) > 0.0) | ~np.isfinite(t))
+        if len(t) < 2 or wrong.size:
+            row = f"; row {wrong[0]} (counted from 0) has {t[wrong[0]]:.12g} s" if wrong.size else ""
             raise ValueError(
-                f"times of the log: {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at "
-                "least 2, all with a finite time."
-            )
-        wrong = np.flatnonzero(np.diff(t) <= 0.0)
-        if wrong.size:
-            k = wrong[0] + 1
-            raise ValueError(
-                f"row {k} of the log (counted from 0) has the same or an earlier time than the one before: {t[k]:.12g} "
-                f"s after {t[k - 1]:.12g} s; {wrong.size} such times in all. Sort the log and keep one row of each "
-                "instant."
+                f"times of the log must be at least 2, finite and increasing, and are {len(t)} with {wrong.size} that "
+                f"are not{row}. Sort the log and keep one row of each instant."
             )
 
     def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":

@@ -94,13 +94,13 @@ class Assimilation:
         self._records, whole = records, batch_of(records) if draw is None else draw()
         if not self.config.iterations:
             return self._descend_anew(whole)
-        before, progress = copy.deepcopy(self.twin.closure.state_dict()), copy.deepcopy(self._progress())
+        before, damping = copy.deepcopy(self.twin.closure.state_dict()), self.damping
         descended, config = self._fit(whole), self.config
         chooses = config.initial is None and (config.method, config.inputs) == ESTIMABLE
         if chooses and not self.estimates and self._noisy(whole):
             self._estimate_first_states(True)
             self.twin.closure.load_state_dict(before)
-            self._resume(progress)
+            self.damping = damping
             descended = self._fit(whole)
         if self.estimates:
             with contextlib.suppress(FloatingPointError):
@@ -122,39 +122,29 @@ class Assimilation:
         if self.config.segment is not None:
             self.length = min(self.config.segment, whole.actions.shape[1])
             return self._descend_anew(self.in_segments(whole))
-        sensors, progress_before = self._problem.sensors, copy.deepcopy(self._progress())
+        sensors, damping = self._problem.sensors, self.damping
         records, before = sensor_records(self.twin.plant, sensors, whole), dict[int, float]()
 
-        def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
-            self._resume(copy.deepcopy(progress_before))
-            self.length = min(length, whole.actions.shape[1])
+        def fit(length: int) -> tuple[tuple[Descended, int, float], Tensor]:
+            self.damping, self.length = damping, min(length, whole.actions.shape[1])
             descended = self._descend_anew(self.in_segments(whole))
             # The first fit of a length begins with the present closure.
             descended = descended._replace(start=before.setdefault(length, descended.start))
-            return (descended, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
+            return (descended, length, self.damping), self._rms(self.in_segments(whole))
 
-        descended, self.length, progress = over_segments(
+        descended, self.length, self.damping = over_segments(
             self.twin.closure,
             whole.actions.shape[1],
             fit,
             EXPLAINED * scatter_of(sensors, records),
             lambda: self._problem.unstable(records),
         )
-        self._resume(progress)
         return descended
 
     def in_segments(self, whole: Trajectory) -> Trajectory:
         """Records as the last fit replayed them: in segments, of shorter records in shorter ones, or whole."""
         length = min(self.length, whole.actions.shape[1])
         return whole.segments(length, self.twin.plant.dt) if length else whole
-
-    def _progress(self) -> dict[str, Any]:
-        """What the next descent depends on, except the closure."""
-        return {"descent": self.descent.state_dict(), "damping": self.damping}
-
-    def _resume(self, progress: dict[str, Any]) -> None:
-        self.descent.load_state_dict(progress["descent"])
-        self.damping = progress["damping"]
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:
         """Descend from the present closure, or from the first one if the twin diverges under the present one.
@@ -285,10 +275,11 @@ class Assimilation:
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
         problem = {"first": self.first, "length": self.length, "estimates": self.estimates, "noise": self.twin.noise}
-        return self._progress() | problem
+        return problem | {"descent": self.descent.state_dict(), "damping": self.damping}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._resume(state)
+        self.descent.load_state_dict(state["descent"])
+        self.damping = state["damping"]
         self._estimate_first_states(state["estimates"])
         self.twin.noise = state["noise"]
         self.length = state["length"]

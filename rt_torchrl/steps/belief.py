@@ -291,23 +291,17 @@ class Belief:
         """Fly the latest real episodes on the present twin.
 
         Returns:
-            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1, or a
-            ``reason`` if noise of the sensors explains it. Nothing if state feedback flew it.
+            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1. Nothing if
+            state feedback flew it.
         """
         known = [flight for flight in self.compared() if not math.isnan(flight.d)]
         if not known or known[-1] is not self.compared()[-1]:
             return metrics()
-        _, d, beyond_noise = known[-1]
         warning, hypothesis = alarm([flight.beyond_noise for flight in known]), self.virtual.twin.hypothesis
-        report = metrics(paired_difference=d, alarm=float(warning is not None))
-        if abs(d) > ALARM and beyond_noise == 0.0:
-            cost = f"{math.exp(d):.3g} times what the twin says of it"
-            report.set_non_tensor("reason", f"noise of the sensors explains that the episode cost {cost}")
+        report = metrics(paired_difference=known[-1].d, alarm=float(warning is not None))
         if warning is None:
             return report
         explained = "" if hypothesis is None else f"; {hypothesis!r} explains the records best"
-        if self.virtual.twin.plant.end_cost is not None:
-            explained += "; or the policy is so near an early end that small errors decide"
         return report.set_non_tensor("warning", warning + explained)
 
     @property

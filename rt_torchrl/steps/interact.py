@@ -1,6 +1,7 @@
 """Step 1: one episode on the real system, what of it is sound, and which policy may act."""
 
 import copy
+import functools
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -301,15 +302,11 @@ class Interact(Step):
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         """Take the step."""
         flights, report = self.take(episode["live"], int(episode["number"]))
-        record, device = flights[-1].record, flights[-1].record.states.device
+        states, actions, exogenous, start, _ = flights[-1].record
         parts = [part for flight in flights for part in flight.parts]
-        episode["record"] = {
-            "states": record.states,
-            "actions": record.actions,
-            "exogenous": record.exogenous,
-            "start": torch.as_tensor(record.start, dtype=torch.float64, device=device),
-            "whole": torch.tensor(flights[-1].whole, device=device),
-        }
+        like = functools.partial(torch.as_tensor, device=states.device)
+        clock = {"start": like(start, dtype=torch.float64), "whole": like(flights[-1].whole)}
+        episode["record"] = {"states": states, "actions": actions, "exogenous": exogenous, **clock}
         episode["transitions"] = {str(number): part for number, part in enumerate(parts)}
         return merged(episode, merged(self._report(flights), report))
 

@@ -55,11 +55,6 @@ def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, targ
     return DDPGLoss(actor, critics[0], loss_function="l2", delay_value=target)
 
 
-def td3_loss(actor: TensorDictModuleBase, critics: list[ValueOperator]) -> LossModule:
-    """TD3: the lower of two values at smoothed target actions (Fujimoto, van Hoof, Meger, ICML 2018)."""
-    return TD3Loss(actor, critics, bounds=(-1.0, 1.0), num_qvalue_nets=len(critics), loss_function="l2")
-
-
 def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]:
     """A loss that prices the entropy of scaled actions: SAC, CrossQ or REDQ."""
 
@@ -83,7 +78,8 @@ METHODS: dict[str, LearningMethod] = {
         gradient_limit=math.inf,
         correction=0.0,
     ),
-    "td3": LearningMethod(td3_loss, critics=2, delay=2),
+    # The lower of two values at smoothed target actions (Fujimoto, van Hoof, Meger, ICML 2018).
+    "td3": LearningMethod(functools.partial(TD3Loss, bounds=(-1.0, 1.0), loss_function="l2"), critics=2, delay=2),
     "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
     "crossq": LearningMethod(entropic(CrossQLoss), critics=2, stochastic=True, squared=False, normalised=True),
     "redq": LearningMethod(entropic(REDQLoss), critics=4, stochastic=True),
