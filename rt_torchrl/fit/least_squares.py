@@ -198,17 +198,15 @@ class Estimate(NamedTuple):
         warnings = []
         if self.segment:
             warnings.append(
-                f"the twin was fitted over segments of {self.segment} control intervals "
-                f"({self.segment * self.likelihood.plant.dt:g} s) with first states of their own, as all errors here "
-                "are; over whole records it may leave what was read, as that of an unstable system does"
+                f"the twin was fitted over segments of {self.segment} control intervals with first states of their "
+                "own, as all errors here are; over whole records it may leave what was read"
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
             if error > EXPLAINED * size > 0.0:
                 warnings.append(
                     f"the twin does not explain {sensor.name}: its RMS error is {error:.3g} {sensor.measurement.unit}, "
-                    f"and the readings scatter by {size:.3g}. Check columns and units, the inputs that act on the "
-                    "system, and what the plant leaves out; then try other first weights (starts)"
+                    f"the readings scatter by {size:.3g}; check columns, units, inputs and plant, then raise starts"
                 )
         if words := not_white(self.likelihood):
             warnings.append(words)

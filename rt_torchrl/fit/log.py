@@ -210,9 +210,8 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
     absent = [signal.name for signal in (*plant.actions, *plant.acting_inputs) if signal.name not in log.columns]
     if absent:
         raise ValueError(
-            f"log of plant {plant.name!r} has no column {', '.join(absent)}; it has {', '.join(log.columns)}. Actions "
-            "and inputs drive the twin, so each is needed: log it, or name its column, such as --columns "
-            f"HEADER={absent[0]}."
+            f"log of plant {plant.name!r} has no column {', '.join(absent)}; it has {', '.join(log.columns)}. Every "
+            f"action and input drives the twin: log it, or name its column, such as --columns HEADER={absent[0]}."
         )
     good = np.ones(len(log.times), dtype=bool)
     for signal in logged_signals(plant):
@@ -225,10 +224,9 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
         if not (drop or inside.all()):
             k = int(np.argmin(inside))
             raise ValueError(
-                f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log (counted from 0, t = "
-                f"{log.times[k]:g} s), {int((~inside).sum())} such rows; it must be a number from {signal.low:g} to "
-                f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with "
-                "--drop (of a training: --log.drop). Where a sensor lacks samples, --missing keeps the row."
+                f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log, one of {int((~inside).sum())}; "
+                f"it must be a number from {signal.low:g} to {signal.high:g} {signal.unit}. Mend the log or the column's "
+                "unit, leave out rows with --drop (of a training: --log.drop), or keep missing samples with --missing."
             )
         good &= inside
     return log if good.all() else log.chosen(good)

@@ -76,9 +76,8 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     if steps > INTERVALS_PER_ROW * rows:  # before it takes memory
         raise ValueError(
             f"column 'time' of the log has a median step of {interval:g} s, so that {rows} rows would become {steps} "
-            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s), more than {INTERVALS_PER_ROW} for each "
-            "row. Times are in seconds: say the unit of the column, such as --columns ms=time*1e-3; or give the twin a "
-            "longer dt."
+            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s). Say the unit of the column if it is not "
+            "seconds, such as --columns ms=time*1e-3, or give the twin a longer dt."
         )
     segments = [_segment(log, slice(first, last + 1), steps, plant) for first, last, steps in enough]
     if not segments:

@@ -171,8 +171,7 @@ class Belief:
         if cost < 0.0 and self.corrects:
             raise ValueError(
                 f"J_a={cost:.4g} of a real episode of plant {self.virtual.twin.plant.name!r} is negative; a training "
-                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
-                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
+                "with a twin compares ratios of costs: let its costs add a constant, or use arm='model_free'."
             )
         if role == FIRST:
             self.first = [*self.first, Flown(trajectory, role, {}, cost)][-ANCHORS:]

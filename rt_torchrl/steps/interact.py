@@ -225,10 +225,7 @@ class Supervisor:
             return policy, role, report | {"predicted_violations": self.predicted(policy, episodes)}
         if self.controller is not None:
             return self.controller, FIRST, report
-        raise ValueError(
-            f"no policy may act. {report['reason']}. Widen the limits, or begin with something that keeps them, such "
-            "as --start controller."
-        )
+        raise ValueError(f"no policy may act. {report['reason']}. Widen the limits, or use --start controller.")
 
     def episodes(self) -> Scenario | None:
         """Virtual episodes in which the limits are checked; None without limits, and before anything is known."""
