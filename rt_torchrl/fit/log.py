@@ -225,8 +225,8 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
             k = int(np.argmin(inside))
             raise ValueError(
                 f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log, one of {int((~inside).sum())}; "
-                f"it must be a number from {signal.low:g} to {signal.high:g} {signal.unit}. Mend the log or the column's "
-                "unit, leave out rows with --drop (of a training: --log.drop), or keep missing samples with --missing."
+                f"it must be a number from {signal.low:g} to {signal.high:g} {signal.unit}. Mend the log or its "
+                "units, leave out rows with --drop (of a training: --log.drop), or keep missing samples with --missing."
             )
         good &= inside
     return log if good.all() else log.chosen(good)

@@ -66,7 +66,8 @@ class DigitalTwin:
         require_end_cost(plant)
         self.plant, self.closure = plant, closure
         self._engine = engine
-        self._replay = self._rollout(closure, None)
+        self.replay = self._rollout(closure, None)
+        """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
         self.sensitivities = Sensitivities(plant, closure)
         self._planned: list[_Planned] = []
         self._read: ReadInterval | None = None
@@ -82,10 +83,6 @@ class DigitalTwin:
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine)
-
-    def replay(self, initial_state: Starts, exogenous: Inputs, actions: Actions, *, start: Start = 0.0) -> Trajectory:
-        """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
-        return self._replay(initial_state, exogenous, actions, start=start)
 
     @torch.no_grad()
     def replayed(self, record: Trajectory, segment: int = 0) -> Float[Tensor, "samples n_s"]:
