@@ -136,6 +136,8 @@ class ScaledPolicy(nn.Module):
         return torch.atanh(share.clamp(-self.EDGE, self.EDGE)), spread
 
 
+CORRECTION = 0.4
+"""Exponent of the importance weights; 1 removes the bias of the prioritised sampling."""
 AT_ONCE = 50
 """Number of batches drawn in one call, between which priorities rest: a draw takes as long as half an iteration."""
 
@@ -179,7 +181,8 @@ class ActorCritic:
         self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
         self.method = method or METHODS[config.algorithm]
         self.batch_size = min(config.batch_size, plant.n_steps)
-        self.memory = (replay or LongTermMemory)(correction=self.method.correction, generator=generator)
+        correction = 0.0 if self.method.relaxed else CORRECTION
+        self.memory = (replay or LongTermMemory)(correction=correction, generator=generator)
         stochastic, n_a = self.method.stochastic, len(plant.actions)
         self.actor = ScaledPolicy(plant, policy, stochastic=stochastic, device=generator.device)
         widths, pair = (len(plant.observations) + n_a, *self.critic_hidden), ["observation", "action"]
@@ -407,7 +410,7 @@ class LongTermMemory:
         capacity: int = 100_000,
         *,
         prioritisation: float = 0.6,
-        correction: float = 0.4,
+        correction: float = CORRECTION,
         generator: torch.Generator,
     ):
         self.capacity, self.prioritisation, self.correction = capacity, prioritisation, correction

@@ -32,10 +32,9 @@ class LearningMethod(NamedTuple):
             critic first, each with one of its target, and then those of the policy, as the paper does.
         squared: whether the loss reports δ² as ``td_error``, and not |δ|.
         normalised: whether the layers of the critics are normalised over a batch.
-        relaxed: whether a critic without targets takes only the share τ of each of its steps.
+        relaxed: whether it is as the paper prints it: a critic without targets takes only the share τ of each of its
+            steps, there are no importance weights, and the policy's gradient has no limit.
         draws: whether the loss draws random numbers.
-        gradient_limit: greatest norm of the policy's gradient.
-        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
     """
 
     make_loss: Callable[[TensorDictModuleBase, list[ValueOperator]], LossModule]
@@ -46,8 +45,6 @@ class LearningMethod(NamedTuple):
     normalised: bool = False
     relaxed: bool = False
     draws: bool = True
-    gradient_limit: float = 1.0
-    correction: float = 0.4
 
 
 def ddpg_loss(actor: TensorDictModuleBase, critics: list[ValueOperator], *, target: bool = True) -> LossModule:
@@ -70,14 +67,7 @@ def entropic(loss: Callable[..., LossModule]) -> Callable[[TensorDictModuleBase,
 
 METHODS: dict[str, LearningMethod] = {
     "ddpg": LearningMethod(ddpg_loss, delay=0, draws=False),
-    "relaxed_ddpg": LearningMethod(
-        functools.partial(ddpg_loss, target=False),
-        delay=0,
-        relaxed=True,
-        draws=False,
-        gradient_limit=math.inf,
-        correction=0.0,
-    ),
+    "relaxed_ddpg": LearningMethod(functools.partial(ddpg_loss, target=False), delay=0, relaxed=True, draws=False),
     # The lower of two values at smoothed target actions (Fujimoto, van Hoof, Meger, ICML 2018).
     "td3": LearningMethod(functools.partial(TD3Loss, bounds=(-1.0, 1.0), loss_function="l2"), critics=2, delay=2),
     "sac": LearningMethod(entropic(SACLoss), critics=2, stochastic=True, squared=False),
@@ -122,7 +112,7 @@ def iteration(learner: "ActorCritic", kind: str, *batch: Tensor) -> dict[str, Te
         loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
         gradients = slopes(loss, learner.actor_adam.weights)
         norm = get_total_norm(gradients)
-        share = (method.gradient_limit / (norm + TINY)).clamp(max=1.0)
+        share = ((math.inf if method.relaxed else LIMIT) / (norm + TINY)).clamp(max=1.0)
         results |= {"value": -losses["loss_actor"].detach(), "actor_gradient": norm}
         steps.append((learner.actor_adam, [(gradient * share).to(gradient.dtype) for gradient in gradients]))
     relaxed = learner.critic_adam.weights if critic and method.relaxed else []
@@ -160,6 +150,8 @@ def traced(learner: "ActorCritic", kind: str, batch: Sequence[Tensor]) -> Callab
             part.copy_(saved)
 
 
+LIMIT = 1.0
+"""Greatest norm of the policy's gradient."""
 TINY = 1e-6
 """Number that ``torch.nn.utils.clip_grad_norm_`` adds to a norm."""
 
