@@ -64,7 +64,8 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
-        latest = list(algorithm.short_term) if algorithm.config.arm != "model_free" else []
+        # Parts of episodes are cut to pieces of one length, as step 4 replays them.
+        latest = algorithm.virtual.paired(algorithm.short_term)[0] if algorithm.config.arm != "model_free" else []
         process = algorithm.virtual.paired([record])[1][0] if algorithm.virtual.processes else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(

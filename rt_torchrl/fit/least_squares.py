@@ -198,8 +198,9 @@ class Estimate(NamedTuple):
         warnings = []
         if self.segment:
             warnings.append(
-                f"the twin was fitted over segments of {self.segment} control intervals with first states of their "
-                "own, as all errors here are; over whole records it may leave what was read"
+                f"the twin was fitted over segments of {self.segment} control intervals "
+                f"({self.segment * self.likelihood.plant.dt:g} s) with first states of their own, as all errors here "
+                "are; over whole records it may leave what was read"
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
