@@ -230,7 +230,7 @@ def test_what_cannot_operate_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
             pass
-    with pytest.raises(ValueError, match="asynchronous needs a function that makes the real system"):
+    with pytest.raises(ValueError, match=r"asynchronous needs a function that makes the real system"):
         small_run(tmp_path, plant=PLANT, parts={"env": machine()}, asynchronous=True)
 
 

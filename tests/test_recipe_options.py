@@ -128,7 +128,7 @@ def pressed(config):
     ("main", "kind", "message"),
     [
         (lambda config: importlib.import_module("not_installed.part"), SystemExit, "error: the package not_installed"),
-        (without_a_package, SystemExit, "error: not_installed is not installed; .* names its extra"),
+        (without_a_package, SystemExit, "error: the package not_installed is not installed; .* --extra EXTRA"),
         (lambda config: Path("gone.bts").read_text(), SystemExit, "error: .*No such file or directory: 'gone.bts'"),
         (lambda config: dataclasses.replace(config, seed=-1), SystemExit, "error: seed=-1 must be"),
         (pressed, SystemExit, "130"),

@@ -194,10 +194,10 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     for part, step in PARTS.items():
         found = load_tensors(folder / file.name)
         del found["state"]["algorithm"][f"module.{step}._extra_state"][part]
-        refused(found, f"does not fit these options.*{part}")
+        refused(found, f"weights of .* do not fit this training.*{part}")
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
-    refused(found, r"(?s)does not fit these options.*policies.*model_free\.gain")
+    refused(found, r"(?s)weights of .* do not fit this training.*policies.*model_free\.gain")
     refused(found | {"format": 2}, "checkpoint-0002.pt has format 2; this version reads 7")
 
 

@@ -59,7 +59,10 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     except Exception as error:  # any error of the user's module
         raise ValueError(f"policy {name} cannot take float64 {tuple(observations.shape)}: {error}") from error
     if shape != (3, len(plant.actions)) or kind != torch.float64:
-        raise ValueError(f"policy {name} returns {kind} {shape}, not float64 (3, {len(plant.actions)}); use .double().")
+        raise ValueError(
+            f"policy {name} returns {kind} {shape} for 3 observations of plant {plant.name!r}; "
+            f"it must return torch.float64 (3, {len(plant.actions)}). A module becomes double by .double()."
+        )
     if not torch.allclose(actions, again, rtol=0.0, atol=0.0, equal_nan=True):
         raise ValueError(f"policy {name} gives two actions for one observation; only a function of it can be exported.")
     return policy

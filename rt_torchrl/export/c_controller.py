@@ -204,7 +204,10 @@ def _traced(controller: Controller) -> dict[str, c_file.TracedFunction]:
         parts["advance"] = c_file.traced(what, advance, example)
         controller.closure = plant.closure
     if not known:
-        raise ValueError(f"{what} cannot be exported: {', '.join(plant.controller_states)} depend on the closure.")
+        raise ValueError(
+            f"{what} cannot be exported: its states ({', '.join(plant.controller_states)}) depend on the closure, "
+            "which a controller does not know. Name in controller_states only what follows from measured signals."
+        )
     return parts
 
 

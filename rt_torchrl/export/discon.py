@@ -130,9 +130,11 @@ def _words(controller: CController, torque: int, pitch: int) -> dict[str, str]:
     plant, signals = controller.controller.plant, controller.signals
     refused = [s for s in (*signals, *plant.actions) if MEASURED.get(s.name, ("", ""))[0] != s.unit]
     if refused:
-        needed = ", ".join(f"{s.name} [{s.unit}]" for s in refused)
         available = ", ".join(f"{name} [{unit}]" for name, (unit, _) in MEASURED.items())
-        raise ValueError(f"the swap array of a DISCON does not give {needed}; it gives {available}.")
+        raise ValueError(
+            f"the swap array of a DISCON does not give {', '.join(f'{s.name} [{s.unit}]' for s in refused)} of plant "
+            f"{plant.name!r}; it gives {available}. Export a policy that observes nothing else."
+        )
     held = [plant.states[k].name for k in controller.controller.held]
     turbine: Any = plant.innermost
     return {

@@ -56,7 +56,10 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
             raise SystemExit(f"error: {error}") from error
         missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
         if isinstance(missing, ModuleNotFoundError):
-            raise SystemExit(f"error: {missing.name} is not installed; the recipe's page names its extra.") from error
+            raise SystemExit(
+                f"error: the package {missing.name} is not installed; the page of the recipe says which extra of "
+                "rt_torchrl brings it, uv run --extra EXTRA."
+            ) from error
         raise
     except KeyboardInterrupt:
         sys.exit(130)  # as shells report Ctrl-C

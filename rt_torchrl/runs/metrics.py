@@ -78,4 +78,7 @@ def judged_on_the_system(summary: Mapping[str, Any]) -> tuple[str, Mapping[str, 
             real = place == "real system"
             costs = summary["real_unseen" if real else "unseen"]["costs"]
             return place if real else "simulation", controllers, costs
-    raise ValueError("a run was judged on its own twin alone; go on with each by --resume and --real-unseen.")
+    raise ValueError(
+        "a run was judged on its own twin alone, and costs on different twins do not compare; go on with each run by "
+        "--resume and --real-unseen, which flies its live policy on the real system."
+    )

@@ -105,7 +105,10 @@ def operation_of(
         ValueError: if one of these does not allow it, or :class:`Operation` raises it.
     """
     if plant.end_cost is not None or make_env is None or config.device != "cpu":
-        raise ValueError("asynchronous needs a function that makes the real system, cpu, and no early ends.")
+        raise ValueError(
+            "asynchronous needs a function that makes the real system in another process, Run(..., env=), episodes "
+            f"that do not end early, and the CPU; here device={config.device!r}, and the plant is {plant.name!r}."
+        )
     acting: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
     if first is not None and first.teacher is not None:
         acting[FIRST] = first.teacher

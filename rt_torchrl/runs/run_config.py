@@ -246,7 +246,10 @@ def plant_of(config: RunConfig) -> Plant:
         ValueError: if the configuration has no method ``plant()``.
     """
     if not isinstance(config, MakesPlant):
-        raise ValueError(f"{type(config).__qualname__} has no method plant(); write one, or give load_run the plant.")
+        raise ValueError(
+            f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one, as "
+            "docs/own_plant.md shows, or give load_run the plant, load_run(folder, plant=...)."
+        )
     return config.plant()
 
 

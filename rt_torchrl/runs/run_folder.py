@@ -134,7 +134,10 @@ def load_checkpoint(folder: Path, algorithm: "ReinforcementTwinning") -> list[di
     try:
         algorithm.load_state_dict(state["algorithm"])
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{file} does not fit these options: {type(error).__name__}: {error} {ANEW}") from error
+        raise ValueError(
+            f"the weights of {file} do not fit this training of {name!r}; start with the options it was started "
+            f"with (see its config.json). {type(error).__name__}: {error} {ANEW}"
+        ) from error
     return checkpoint["episodes"]
 
 

@@ -50,7 +50,10 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         return None
     if is_log and path.is_file():
         return _of_log(path, config, plant)
-    raise ValueError(f"start={name!r} is none of {', '.join(STARTS)}, no run folder, and no log {', '.join(READERS)}.")
+    raise ValueError(
+        f"start={name!r} is none of {', '.join(STARTS)}, and there is no such run folder or log; a log ends in "
+        f"{' or '.join(READERS)}."
+    )
 
 
 def _of_run(folder: Path, config: RunConfig, plant: Plant) -> EarlierPolicies:

@@ -245,7 +245,10 @@ def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollec
         ValueError: if the batch size of the system is not 1.
     """
     if env.batch_size != torch.Size([1]):
-        raise ValueError(f"batch_size={tuple(env.batch_size)} of the real system must be (1,); use a RealSystem.")
+        raise ValueError(
+            f"batch_size={tuple(env.batch_size)} of the real system must be (1,): Reinforcement Twinning learns after "
+            "every one episode of one system. Put an environment without a batch into a RealSystem."
+        )
     if type(env) is PlantEnv:  # a subclass may override any part of a step
         return FlightCollector(env, actor)
     return EpisodeCollector(env, actor, plant)

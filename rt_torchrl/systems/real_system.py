@@ -223,7 +223,10 @@ class RealSystem(EnvBase):
         if self._applied is not None:
             self._applied.read(imagined["next"], self.plant.actions, "applied", finite=False)
         elif "applied" in self.env.full_observation_spec:
-            raise ValueError('the environment reports what it has applied: give applied=Reading(keys=("applied",)).')
+            raise ValueError(
+                "the environment reports the action that it has applied, as a safety layer does, but no reading reads "
+                'it: give applied=Reading(keys=("applied",)), in the plant\'s units.'
+            )
         limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)  # of Gymnasium
         if limit is not None and limit < self.plant.n_steps:
             raise ValueError(

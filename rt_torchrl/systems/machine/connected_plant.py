@@ -130,7 +130,8 @@ class ConnectedPlant(ForeignSystem):
     ):
         if not entries or not actions or len(commands) != len(actions):
             raise ValueError(
-                f"entries={list(entries)} and commands={list(commands)} must name tags, one for each action."
+                f"entries={list(entries)} must not be empty, and commands={list(commands)} must be one tag for each of "
+                f"the actions {[action.name for action in actions]}."
             )
         if answered is not None and sample is None:
             raise ValueError(f"answered={answered!r} takes the number of a sample; name the tag that counts, sample.")

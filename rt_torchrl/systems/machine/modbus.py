@@ -69,7 +69,10 @@ class ModbusLink:
     def __init__(self, client: Any, read: Mapping[str, Register], written: Mapping[str, Register], *, device: int = 1):
         for what, registers in (("read", read), ("written", written)):
             if len({register.table for register in registers.values()}) != 1 or _span(registers.values())[1] > MOST:
-                raise ValueError(f"{what}={dict(registers)} must be of one table, and span at most {MOST}.")
+                raise ValueError(
+                    f"{what}={dict(registers)} must be registers of one table that one request takes, which spans at "
+                    f"most {MOST}; let the plant hold the tags beside each other."
+                )
         self._written = dict(sorted(written.items(), key=lambda item: item[1].address))
         ordered = list(self._written.values())
         gaps = any(first.end != second.address for first, second in zip(ordered, ordered[1:], strict=False))
@@ -156,7 +159,10 @@ class ModbusLink:
             return answer
         code = getattr(answer, "exception_code", None)
         if code in REFUSALS:
-            raise RefusedRequestError(f"{self._address} refuses {what}: {REFUSALS[code]}. Mend addresses or rights.")
+            raise RefusedRequestError(
+                f"{self._address} refuses {what}: exception {code}, {REFUSALS[code]}. Mend the addresses, or what the "
+                "machine lets a client read and write."
+            )
         raise LateAnswerError(f"{self._address} does not answer {what} now: {answer}")
 
     def close(self) -> None:

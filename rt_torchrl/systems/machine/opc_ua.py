@@ -117,7 +117,10 @@ class OpcUaLink:
                     raise ValueError("it takes whole numbers")
             struct.pack(f"<{FORMATS[kind.name]}", number)
         except (ValueError, OverflowError, struct.error) as error:
-            raise RefusedRequestError(f"{self.url}: {tag!r} = {value:g} does not fit {kind.name}: {error}.") from error
+            raise RefusedRequestError(
+                f"{self.url}: {tag!r} = {value:g} does not fit node {self._written[tag]!r} of type {kind.name}: "
+                f"{error}; give the machine a node of type Double."
+            ) from error
         return self._ua.Variant(number, kind)
 
     def read(self) -> dict[str, float]:
