@@ -70,7 +70,10 @@ def main(config: Config) -> None:
     run = rt.load_run(config.run, config.recipe)
     policy = run.policy(config.role)
     if isinstance(policy, rt.StateFeedback) and {"policy", "controller"} & set(config.what):
-        raise ValueError(f"role={config.role!r} cannot be exported; export the model-free policy, --role model_free.")
+        raise ValueError(
+            f"role={config.role!r} of this run plans its actions by model predictive control and cannot be exported; "
+            "export the model-free policy, which has learned from its records, by --role model_free."
+        )
     output = config.output or config.run / "exported"
     make_folder("output", output)
     for kind in formats:

@@ -75,7 +75,9 @@ class Config:
             plant = make()
             return plant if self.dt is None else make(dt=self.dt, horizon=round(plant.horizon / self.dt) * self.dt)
         except TypeError as error:
-            raise ValueError(f"plant={self.plant!r} cannot be made: {error}; its arguments need defaults.") from error
+            raise ValueError(
+                f"plant={self.plant!r} cannot be made ({error}): arguments need defaults, and --dt needs a horizon."
+            ) from error
 
     def guesses(self) -> dict[str, float]:
         """First guesses of hidden states, by name."""

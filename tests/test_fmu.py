@@ -155,7 +155,7 @@ def test_an_fmu_takes_the_inputs_that_act_and_what_does_not_fit_is_refused(turbi
         (lambda: environment(tmp_path / "no.fmu"), "is no FMU that can be read"),
         (
             lambda: environment(turbine, outputs=["omega"]),
-            r"outputs \['omega'\] are no variables of type Real; it has",
+            r"outputs \['omega'\] are no variables of type Real in tur",
         ),
         (lambda: environment(turbine, exogenous=["a", "b"]), "must name 1 variables, or none"),
         (lambda: export_policy_fmu(torch.nn.Identity(), tmp_path / "policy.zip", PLANT), "must end in .fmu"),

@@ -45,7 +45,7 @@ def test_a_folder_in_use_is_refused_until_it_is_let_go(tmp_path):
     (tmp_path / ".checkpoint.pt.1-ab.partial").touch()  # left by a killed writer
     folder = RunFolder(RunConfig(log_dir=tmp_path), "p")
     assert not list(tmp_path.glob(".*.partial"))
-    with pytest.raises(ValueError, match="log_dir=.* is in use"):
+    with pytest.raises(ValueError, match="log_dir=.* is in use by another training"):
         RunFolder(RunConfig(log_dir=tmp_path), "p")
     folder.release()
     RunFolder(RunConfig(log_dir=tmp_path), "p").release()
@@ -119,7 +119,7 @@ def test_what_is_saved_is_read_back(tmp_path):
     expected = CONTENT | {"module": dict(module.state_dict()), "number": 0.1, "size": (2,)}
     for found in (load_tensors(file), torch.load(file, weights_only=True)):
         assert same(found, expected) and type(found["module"]) is dict and type(found["number"]) is float
-    with pytest.raises(ValueError, match=r"\['real_system'\]\['rng'\]\[1\] to be saved is a ndarray"):
+    with pytest.raises(ValueError, match=r"\['real_system'\]\['rng'\]\[1\] of what is to be saved is a ndarray"):
         save_tensors(file, {"real_system": {"rng": [0, np.zeros(2)]}})
     assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"] and same(load_tensors(file), expected)
 
@@ -198,7 +198,7 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights of .* do not fit this training.*policies.*model_free\.gain")
-    refused(found | {"format": 2}, "checkpoint-0002.pt has format 2; this version reads 7")
+    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 7")
 
 
 def test_a_config_of_somebody_else_is_not_overwritten(tmp_path):

@@ -57,14 +57,20 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
         actions, again = policy(observations), policy(observations)
         kind, shape = actions.dtype, tuple(actions.shape)
     except Exception as error:  # any error of the user's module
-        raise ValueError(f"policy {name} cannot take float64 {tuple(observations.shape)}: {error}") from error
+        raise ValueError(
+            f"policy {name} cannot take float64 observations of shape {tuple(observations.shape)} of plant "
+            f"{plant.name!r}: {error}"
+        ) from error
     if shape != (3, len(plant.actions)) or kind != torch.float64:
         raise ValueError(
             f"policy {name} returns {kind} {shape} for 3 observations of plant {plant.name!r}; "
             f"it must return torch.float64 (3, {len(plant.actions)}). A module becomes double by .double()."
         )
     if not torch.allclose(actions, again, rtol=0.0, atol=0.0, equal_nan=True):
-        raise ValueError(f"policy {name} gives two actions for one observation; only a function of it can be exported.")
+        raise ValueError(
+            f"policy {name} gives two actions for one observation, by random numbers or a memory; only a function of "
+            "the observation alone can be exported."
+        )
     return policy
 
 
@@ -136,6 +142,7 @@ def require_close(
         row, column = divmod(int(errors.argmax()), len(signals))
         raise ValueError(
             f"{what} differs from the original by {errors.max().item():.2g} of the range or size of "
-            f"{signals[column].name!r} in sample {row}; at most {tolerance:g} is allowed, and nothing was written."
+            f"{signals[column].name!r} in sample {row}; at most {tolerance:g} is allowed, and nothing was written. No "
+            "result may depend on the batch as a whole."
         )
     return errors.max().item()

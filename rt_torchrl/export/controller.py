@@ -51,7 +51,10 @@ class Controller:
         """
         start = self.plant.controller_start(measured, inputs)
         if start.shape[-1:] != (len(self.held),):
-            raise ValueError(f"controller_start returns {tuple(start.shape)}, not {len(self.held)} controller_states.")
+            raise ValueError(
+                f"controller_start of plant {self.plant.name!r} returns shape {tuple(start.shape)}; its last dimension "
+                f"must be {len(self.held)}, the number of controller_states."
+            )
         return start
 
     def act(

@@ -62,7 +62,8 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     except Exception as error:  # torch.export, its exporter and onnxruntime raise many kinds, of several modules
         raise ValueError(
             f"policy {type(policy).__name__} has no ONNX form that onnxruntime runs in double precision: "
-            f"{str(error).strip()}. Write branches as torch.where, and sizes so that any batch can be passed, or use C."
+            f"{str(error).strip()}. Write branches on values as torch.where, and sizes so that any batch can be "
+            "passed, or use C."
         ) from error
 
     def run(rows: Tensor) -> Tensor:

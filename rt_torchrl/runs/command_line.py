@@ -193,5 +193,8 @@ def plant_class(name: str) -> type[Plant]:
     plants = shipped_plants()
     kind = attribute(module_of(Path(file)), own) if file else plants.get(name)
     if not (inspect.isclass(kind) and issubclass(kind, Plant)):
-        raise ValueError(f"plant={name!r} does not exist; choose one of {', '.join(plants)}, or FILE.py:NAME.")
+        raise ValueError(
+            f"plant={name!r} does not exist; choose one of {', '.join(plants)}, or name a class derived from Plant as "
+            "FILE.py:NAME."
+        )
     return kind

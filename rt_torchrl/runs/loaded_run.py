@@ -111,7 +111,10 @@ class LoadedRun:
         if not isinstance(policy, nn.Module | StateFeedback):
             raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
         if on == "real" and self._only_on_the_twin:
-            raise ValueError("nobody knows the true closure of this run's real system; give on='twin'.")
+            raise ValueError(
+                "nobody knows the true closure of this run's real system, so that on='real' cannot be simulated; give "
+                "on='twin'."
+            )
         believed = self.twin.believed
         plant, closure = (self.plant, self.plant.closure) if on == "real" else (believed.plant, believed.closure)
         generator = torch.Generator().manual_seed(seed)
@@ -236,7 +239,10 @@ def load_run(
     settings = read_settings(folder)
     config_class = class_of(folder, settings) if recipe is None else config_class_of(recipe)
     if not (folder / "weights.pt").is_file():
-        raise ValueError(f"the run in {folder} has no weights.pt: it is not finished; go on with it by --resume.")
+        raise ValueError(
+            f"the run in {folder} has no weights.pt: it is not finished. Go on with it by --resume; Ctrl-C ends it "
+            "and leaves the weights of the episodes done."
+        )
     weights = load_tensors(folder / "weights.pt")
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant

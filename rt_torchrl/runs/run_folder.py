@@ -75,7 +75,10 @@ def plain(value: Any, place: str = "") -> Any:
         return entries if isinstance(value, list) else tuple(entries)
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise ValueError(f"{place or 'content'} to be saved is a {type(value).__name__}: give tensors, numbers, strings.")
+    raise ValueError(
+        f"{place or 'content'} of what is to be saved is a {type(value).__name__}; a state_dict may hold tensors, "
+        "numbers and strings, in dicts, lists and tuples."
+    )
 
 
 FORMAT = 7
@@ -127,7 +130,9 @@ def load_checkpoint(folder: Path, algorithm: "ReinforcementTwinning") -> list[di
     except ValueError as error:
         raise ValueError(f"{error} Remove it to go on from the checkpoint before it. {ANEW}") from error
     if checkpoint.get("format") != FORMAT:
-        raise ValueError(f"{file} has format {checkpoint.get('format')}; this version reads {FORMAT}. {ANEW}")
+        raise ValueError(
+            f"{file} has checkpoint format {checkpoint.get('format')}; this version reads format {FORMAT}. {ANEW}"
+        )
     name, state = algorithm.twin.plant.name, checkpoint["state"]
     if state["plant"] != name:
         raise ValueError(f"{file} is of plant {state['plant']!r}, this training of {name!r}; use its recipe. {ANEW}")
@@ -186,7 +191,10 @@ class RunFolder:
         try:
             self._lock.acquire(timeout=0)
         except (filelock.Timeout, OSError) as error:
-            raise ValueError(f"log_dir={self.path} is in use ({error}); choose another folder.") from error
+            raise ValueError(
+                f"log_dir={self.path} is in use by another training, or cannot be locked ({error}); wait for its end, "
+                "or choose another folder."
+            ) from error
         for folder in (self.path, self.path / "figures"):
             remove_partials(folder)
 

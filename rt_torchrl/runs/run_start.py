@@ -130,7 +130,8 @@ def known_physics(
     if modelled != sensed:
         raise ValueError(
             f"a twin of plant {plant.name!r} with the states {', '.join(modelled)} cannot be fitted to records of "
-            f"{', '.join(sensed)}, which is what sensors read; let believed() give the plant without its extensions."
+            f"{', '.join(sensed)}, which is all that sensors read; let believed() of the Config give the plant without "
+            "its extensions."
         )
     models = [plant] if believed is None else [plant, believed]
     reports = [check_plant(model, steps=CHECKED_STEPS, traced=False, trained=model is physics) for model in models]
@@ -160,11 +161,20 @@ def _require_simulation(config: RunConfig, env: RealSystem | None, baselines: di
     if env is not None and config.noise:
         raise ValueError(f"noise={config.noise} needs a plant in simulation; this run has a real system.")
     if env is None and config.real_unseen:
-        raise ValueError(f"real_unseen={config.real_unseen} needs a real system; unseen counts simulated episodes.")
+        raise ValueError(
+            f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
+            "its own; leave it out, and unseen says how many episodes are simulated."
+        )
     if real and not (unknown and config.real_unseen):
-        raise ValueError(f"baselines {real} can only be flown on the real system: give one, and real_unseen.")
+        raise ValueError(
+            f"baselines {real} can only be flown on the real system: give a RealSystem without its closure, and "
+            "real_unseen, the number of episodes that each may fly, or leave them out."
+        )
     if unknown and config.reference:
-        raise ValueError(f"reference={config.reference} needs the closure of the real system; leave it out.")
+        raise ValueError(
+            f"reference={config.reference} is computed on the plant under the true closure, and the real system's is "
+            "not known; leave it out, or give the RealSystem its closure."
+        )
 
 
 def _acts_on_the_real_system(law: object) -> bool:

@@ -63,7 +63,10 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """
     file = folder / FILE
     if not file.is_file():
-        raise ValueError(f"{folder} is no run folder: it has no {FILE}. Give one that a recipe printed at its end.")
+        raise ValueError(
+            f"{folder} is no run folder: it has no {FILE}. Give the folder that a recipe printed at its end, such "
+            "as runs/wind_turbine/TIME-seed-0."
+        )
     settings = read_json(file)
     if not isinstance(settings.get("plant"), str):
         raise ValueError(f"{file} is not that of a run: it does not name a plant.")
@@ -187,7 +190,8 @@ def require_same(folder: Path, config: RunConfig, controllers: Mapping[str, Any]
     if changed:
         raise ValueError(
             f"log_dir={folder} is to be resumed with other options or another classical controller than its own: "
-            f"{'; '.join(changed)}. Give the run's own, or another folder, and --start {folder} to go on from it."
+            f"{'; '.join(changed)}. Give the run's own, or another folder for a new run, which takes policies and twin "
+            f"of this one by --start {folder}."
         )
 
 

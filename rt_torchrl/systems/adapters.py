@@ -125,7 +125,9 @@ class CallingSimulator(ForeignSystem):
         for name, size in self._sizes.items():
             values = reported.get(name)
             if values is None or np.shape(values) != (size,):
-                raise ValueError(f"the simulator reports {name}={values!r}; `reports` declares {size} numbers.")
+                raise ValueError(
+                    f"the simulator reports {name}={values!r}; it must be {size} numbers, as declared in `reports`."
+                )
             entries[name] = torch.as_tensor(np.asarray(values, dtype=np.float64))
         return TensorDict(entries, batch_size=self.batch_size)
 
@@ -141,7 +143,10 @@ class CallingSimulator(ForeignSystem):
         self._actions.put(None)
         thread.join(self.patience)
         if thread.is_alive():
-            raise RuntimeError(f"the simulator must return within {self.patience:g} s of EpisodeAbandoned.")
+            raise RuntimeError(
+                f"the simulator has not returned {self.patience:g} s after its episode was abandoned; let "
+                "EpisodeAbandoned, which its controller raises then, end it."
+            )
 
     def close(self, **kwargs: Any) -> None:
         self.end_episode()
@@ -212,7 +217,10 @@ class FMUEnvironment(ForeignSystem):
     def _require(self, names: Mapping[str, Sequence[str]]) -> None:
         for what, variables in names.items():
             if unknown := [name for name in variables if name not in self._places]:
-                raise ValueError(f"{what} {unknown} are no variables of type Real; it has {', '.join(self._places)}.")
+                raise ValueError(
+                    f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "
+                    f"{', '.join(self._places)}."
+                )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         generator = torch.Generator().manual_seed(self._seed)

@@ -60,7 +60,10 @@ class SafetyConfig:
         for entry, count in self.frozen.items():
             counts = array_of("frozen", count)
             if not ((counts >= 2.0) | (counts == 0.0)).all():
-                raise ValueError(f"frozen={counts.tolist()} readings of {entry!r} must be at least 2, or 0 for none.")
+                raise ValueError(
+                    f"frozen={counts.tolist()} readings of {entry!r} must be at least 2, a reading and its repetition; "
+                    "0 does not watch a component."
+                )
 
 
 def _require_order(what: str, least: float | Sequence[float], greatest: float | Sequence[float]) -> None:

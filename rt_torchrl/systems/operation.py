@@ -276,11 +276,17 @@ class Operation:
 
     def __init__(self, operator: Operator, system: EnvBase):
         if operator.config.continuous and not isinstance(system, RealSystem):
-            raise ValueError("continuous operation needs a RealSystem; leave out --operation.continuous.")
+            raise ValueError(
+                f"continuous operation needs a RealSystem, which goes on without a reset; {type(system).__name__} does "
+                "not. Leave out --operation.continuous."
+            )
         try:
             self._operator = pickle.dumps(operator)
         except Exception as error:  # pickle raises many kinds
-            raise ValueError(f"what acts cannot be sent to a process of its own; let it pickle: {error}") from error
+            raise ValueError(
+                f"what acts cannot be sent to a process of its own ({type(error).__name__}: {error}); give "
+                "policies and systems that pickle."
+            ) from error
         self.system, self.version = system, -1
         self.orders: dict[int, Order] = {}
         self.report: SafetyReport | None = None

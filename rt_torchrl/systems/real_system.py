@@ -230,12 +230,15 @@ class RealSystem(EnvBase):
         limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)  # of Gymnasium
         if limit is not None and limit < self.plant.n_steps:
             raise ValueError(
-                f"the environment truncates an episode after {limit} of {self.plant.n_steps} control intervals; use a "
-                f"horizon of at most {limit * self.plant.dt:g} s, or a greater max_episode_steps."
+                f"the environment truncates an episode after {limit} of the {self.plant.n_steps} control intervals of "
+                f"plant {self.plant.name!r}; use a horizon of at most {limit * self.plant.dt:g} s, or make the "
+                "environment with a greater max_episode_steps."
             )
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
-            raise ValueError(f"key={key!r} of the actuation is no action; choose of {self.env.action_keys}.")
+            raise ValueError(
+                f"key={key!r} of the actuation is no action of the environment; it has {self.env.action_keys}."
+            )
         spec = self.env.full_action_spec[key]
         if not isinstance(spec, Bounded | Unbounded) or spec.shape[len(self.env.batch_size) :].numel() != len(names):
             raise ValueError(f"the environment's action is {spec}; the plant needs continuous ones for {names}.")
@@ -249,8 +252,9 @@ class RealSystem(EnvBase):
             slack = 1e-6 * (action.high - action.low)  # bounds in single precision
             if low > action.low + slack or high < action.high - slack:
                 raise ValueError(
-                    f"action {action.name!r} ranges over [{action.low:g}, {action.high:g}] {action.unit}, the "
-                    f"environment's over [{low:g}, {high:g}]; narrow it, or mend scale and offset of the actuation."
+                    f"action {action.name!r} of plant {self.plant.name!r} ranges over "
+                    f"[{action.low:g}, {action.high:g}] {action.unit}, the environment's over [{low:g}, {high:g}]; "
+                    "narrow the plant's, or mend scale and offset of the actuation."
                 )
 
     def _input(self, reported: TensorDictBase, *, finite: bool = True) -> Float[Tensor, "1 n_z"]:

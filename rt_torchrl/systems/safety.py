@@ -235,7 +235,10 @@ class SafetyLayer(AroundSystem):
         if env.batch_size.numel() != 1:
             raise ValueError(f"env has batch_size={tuple(env.batch_size)}; a safety layer guards one system.")
         if list(env.action_keys) != ["action"] or not env.action_spec.dtype.is_floating_point:
-            raise ValueError(f"env has actions {list(env.action_keys)}; a layer guards one continuous 'action'.")
+            raise ValueError(
+                f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
+                "continuous entry 'action'."
+            )
         plant = getattr(innermost(env), "plant", None)
         if isinstance(plant, Plant) and not abs(config.interval - plant.dt) <= ROUNDING * plant.dt:
             raise ValueError(
@@ -333,7 +336,9 @@ class SafetyLayer(AroundSystem):
         if tripped:
             action, reasons["fallback"] = other, "watchdog tripped"
             if action.shape != self.action_spec.shape or not action.isfinite().all():
-                raise ValueError(f"fallback gave {action}; it must be finite, of shape {self.action_spec.shape}.")
+                raise ValueError(
+                    f"fallback gave {action} at t = {t:g} s; it must be finite, of shape {self.action_spec.shape}."
+                )
         applied, held = self.limits(action, self._last)
         return applied, reasons | held
 

@@ -79,7 +79,9 @@ class ModbusLink:
         if gaps or ordered[0].table == "input":
             raise ValueError(f"written={dict(written)} must be holding registers one behind the other, without gaps.")
         if client.retries:
-            raise ValueError(f"retries={client.retries} of the client must be 0: retries hold up commands.")
+            raise ValueError(
+                f"retries={client.retries} of the client must be 0: while it tries again, no command reaches the plant."
+            )
         require_range("timeout", client.comm_params.timeout_connect, *LONGEST, unit="s", of="the client")
         self._client, self._device, self._read, self.quality = client, device, dict(read), dict[str, str]()
         self._address = f"{client.comm_params.host}:{client.comm_params.port}"

@@ -126,13 +126,16 @@ class OpcUaLink:
     def read(self) -> dict[str, float]:
         rows = self._within(self._connected().read_attributes(self._sources), self.timeout)
         reading, self.quality = {}, {}
-        for tag, row in zip(self._read, rows, strict=True):
+        for (tag, identifier), row in zip(self._read.items(), rows, strict=True):
             value = None if row.Value is None else row.Value.Value
             good = row.StatusCode is None or row.StatusCode.is_good()
             if not good or value is None:
                 reading[tag], self.quality[tag] = math.nan, "no value" if good else row.StatusCode.name
             elif isinstance(value, bool) or not isinstance(value, int | float):
-                raise RefusedRequestError(f"{self.url} has {value!r} behind tag {tag!r}; name a numeric node.")
+                raise RefusedRequestError(
+                    f"{self.url} has no number behind tag {tag!r} at node {identifier!r}, but {value!r}; name a "
+                    "node of a numeric type."
+                )
             else:
                 reading[tag] = float(value)
         return reading
@@ -148,7 +151,8 @@ class OpcUaLink:
             if not status.is_good() or status.name == "GoodClamped":
                 raise RefusedRequestError(
                     f"{self.url} refuses {tag!r} = {value:g} at node {self._written[tag]!r} of type "
-                    f"{self._types[tag].name}: {status.name}, {status.doc} Mend the node, or the range of the action."
+                    f"{self._types[tag].name}: {status.name}, {status.doc} Mend type, range or rights of the "
+                    "node, or the range of the action."
                 )
 
     def _connected(self) -> Any:
