@@ -167,7 +167,7 @@ class Misstarted(Lagged):
     ("kind", "message"),
     [
         (Guessed, r"integral, filtered_position\) depend on the closure"),
-        (Misstarted, r"returns \(1, 1\), not 2 controller_states"),
+        (Misstarted, r"returns shape \(1, 1\); its last dimension must be 2"),
     ],
 )
 def test_what_is_no_controller_is_refused(kind, message, tmp_path):
