@@ -13,7 +13,7 @@ from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 import rt_torchrl as rt
 from rt_torchrl.options import configuration
 
-CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, CHATTER = range(6)
+CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST, CHATTER = range(7)
 
 
 class Spring(LinearGain):
@@ -21,6 +21,13 @@ class Spring(LinearGain):
 
     def forward(self, observation):
         return super().forward(observation[..., :1])
+
+
+class Pushed(LinearQuadratic):
+    """The oracle plant with a quantity of its own."""
+
+    def merit(self, states, actions, exogenous):
+        return {"mean force [N]": actions.abs().mean((-1, -2))}
 
 
 PLANNER = rt.PlannerConfig(starts=0, receding_horizon=rt.PredictiveConfig(horizon=3.0))
@@ -43,7 +50,7 @@ class Config(rt.RunConfig):
     twinning: rt.TwinningConfig = field(default_factory=lambda: MODEL_BASED)
 
     def plant(self):
-        return LinearQuadratic(noise=0.01)
+        return Pushed(noise=0.01)
 
     def make_policy(self, plant, generator):
         return LinearGain([[0.1, 0.1]]) if self.policy == "full" else Spring([[0.1]])
@@ -84,11 +91,13 @@ def rewrite(run, *dropped, baselines=None, **changes):
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
 
 
-def test_a_run_that_ended_well_has_no_reason(run):
+def test_a_run_that_ended_well_has_no_reason_and_the_user_judges_that_it_acts_more(run):
     reasons = rt.diagnose(run)
     # Ten episodes from random initial states scatter too much to compare them with those of the plan.
-    assert [reason.holds for reason in reasons] == [False, False, False, False, None, False]
+    assert [reason.holds for reason in reasons] == [False, False, False, False, None, None, False]
     assert all(reason.evidence and reason.remedy for reason in reasons)
+    evidence = reasons[COST].evidence
+    assert "judge whether it is better: mean force [N]" in evidence and "against 0 of still" in evidence
 
 
 def test_a_policy_above_the_least_cost_of_its_class_is_in_a_poor_minimum(run):
@@ -133,7 +142,7 @@ def test_unseen_episodes_that_cost_more_than_planned_have_other_inputs(run, coun
 def test_what_a_run_does_not_say_is_no_reason(run):
     rewrite(run, "J_a_plan", "alarm", baselines={})
     reasons = rt.diagnose(run)
-    assert [reasons[k].holds for k in (CLASSICAL, TWIN, INPUTS)] == [None, None, None]
+    assert [reasons[k].holds for k in (TWIN, INPUTS, COST)] == [None, None, None]
 
 
 def test_predictive_control_has_no_weights_in_a_minimum(tmp_path):

@@ -54,7 +54,7 @@ def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
     run_code("finished_run.md", code.replace("diagnose(run)", "diagnose(run, episodes=2)"))
     shown = capsys.readouterr().out
     assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
-    assert shown.count(" | ") == 6 * 3  # six reasons
+    assert shown.count(" | ") == 7 * 3  # seven reasons
     assert (tmp_path / "states.png").exists() and (tmp_path / "learning.png").exists()
 
 

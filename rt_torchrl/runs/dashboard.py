@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,7 @@ WORDS = {
 
 
 QUIET = 10.0
-"""Time after which a log that has said nothing names the step that begins [s]."""
+"""Time for which a log says nothing before it names the step under way [s]."""
 
 
 class Progress:
@@ -105,27 +106,35 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True, disable=None)
         self._total, self._line_at = total, -QUIET
         self._costs, self._doing, self._alarm = "", "starting", False
+        self._later = Timer(QUIET, self._log)
 
     def __enter__(self) -> "Progress":
         return self
 
     def __exit__(self, *raised: object) -> None:
+        self._later.cancel()
         self._doing = ""
         self._show()
         self._bar.close()
 
     def doing(self, what: str) -> None:
         """Show what begins now: the name of a step of the algorithm, or any other words."""
+        self._later.cancel()
         self._doing = WORDS.get(what, what)
         self._show()
         if time.monotonic() - self._line_at > QUIET:
             self._log(self._doing)
+            return
+        self._later = Timer(QUIET, self._log, (self._doing,))  # where it takes long
+        self._later.daemon = True
+        self._later.start()
 
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
 
         A line says when the twin's predictions begin or cease to be wrong, and why no policy may act.
         """
+        self._later.cancel()
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:

@@ -1,8 +1,8 @@
-"""Good twin, poor policy: which of six reasons holds in a finished run, and what says so."""
+"""Good twin, poor policy: which of seven reasons holds in a finished run, and what says so."""
 
 import copy
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -18,8 +18,8 @@ from rt_torchrl.steps.belief import NOISE
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 
-MINIMUM, CLASS, INPUTS = 0.03, 0.1, 0.2
-"""Shares of J_a from which a better minimum, a better controller and dearer inputs count."""
+MINIMUM, CLASS, INPUTS, MERIT = 0.03, 0.1, 0.2, 0.2
+"""Shares of J_a from which a better minimum, a better controller and dearer inputs count, and share of a merit."""
 OVER = 5
 """How many times as many episodes weights are sought on as they are judged in: the best for few fail in others."""
 JUMP, OFTEN = 0.5, 0.2
@@ -68,6 +68,7 @@ def diagnose(run: LoadedRun, *, episodes: int = 10) -> list[Reason]:
         minimum,
         _class(run, unseen, validation, best),
         _inputs(run, costs),
+        _merits(run),
         _chattering(believed.plant, flown),
     ]
 
@@ -161,6 +162,34 @@ def _inputs(run: LoadedRun, costs: Costs) -> Reason:
         return Reason(name, None, "what the last plan expected is not the cost of the live policy on the twin", remedy)
     evidence = f"unseen episodes cost {costs.mean():.4g} on the twin, the last plan expected {planned[-1]:.4g}"
     return Reason(name, _dearer(costs, costs.new_full((1,), planned[-1]), INPUTS), evidence, remedy)
+
+
+def _merits(run: LoadedRun) -> Reason:
+    """Whether the policy is cheaper than a classical controller, and yet another one in what users look at.
+
+    A plant does not say whether more of a quantity is better, so that the user has to judge.
+    """
+    name, remedy = "the cost is not what was meant", "weights of the cost (docs/observations_and_costs.md)"
+    unseen: dict[str, Any] = run.metrics["summary"]["unseen"]
+    live, others = run.live, unseen["baselines"]
+    merit = unseen["merit"][live]
+    if not merit or not others:
+        missing = "the plant has no merit" if others else "no classical controller flew beside the policy"
+        return Reason(name, None, missing, remedy)
+    cost, differences = unseen[f"J_a_{live}"]["mean"], []
+    costs = {key: other["J_a"]["mean"] for key, other in others.items()}
+    dearer = [key for key, its_cost in costs.items() if None not in (cost, its_cost) and cost < its_cost]
+    if not dearer:
+        return Reason(name, False, "it is cheaper than no classical controller", remedy)
+    for key in dearer:
+        other = others[key]
+        for quantity, value in merit.items():
+            mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
+            if None not in (mean, its_mean) and abs(mean - its_mean) > MERIT * abs(its_mean):
+                differences.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
+    if differences:
+        return Reason(name, None, f"it is cheaper; judge whether it is better: {'; '.join(differences)}", remedy)
+    return Reason(name, False, f"it is cheaper than {', '.join(dearer)}, and alike in every merit", remedy)
 
 
 def _chattering(plant: Plant, flown: Trajectory) -> Reason:

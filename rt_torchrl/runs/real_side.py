@@ -25,7 +25,7 @@ from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -134,27 +134,41 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
     return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
 
 
-def entries(flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role) -> dict[str, Any]:
+def entries(
+    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
+) -> dict[str, Any]:
     """The entry ``real_unseen`` of the summary, without J_p.
 
-    Where the live policy met the same starts and inputs as another controller, ``ratio`` is the mean of its costs over
-    that of the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
+    Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
+    the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
 
     Args:
+        plant: plant of the real system.
         flights: flights by the name of the controller.
         judged: what these cost.
         live: name of the live policy, which need not have flown.
     """
-    met = {name: (flown.states[:, 0], flown.exogenous) for name, flown in flights.items()}
     controllers = {}
     for name, judgement in judged.items():
         controllers[name] = judgement.statistics()
-        if name != live and live in flights and all(map(torch.equal, met[name], met[live])):
+        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
             controllers[name] |= compared(judged[live].control_costs, judgement.control_costs)
     return {
         "controllers": controllers,
         "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
     }
+
+
+def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
+    """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
+    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
+        return False
+    for flights in zip(flown.each(), other.each(), strict=True):
+        inputs = [until_end(plant, flight).exogenous for flight in flights]
+        n = min(map(len, inputs))
+        if not torch.equal(inputs[0][:n], inputs[1][:n]):
+            return False
+    return True
 
 
 def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:

@@ -324,7 +324,7 @@ class Run:
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        entry = real_side.entries(flights, judged, live)
+        entry = real_side.entries(episodes.plant, flights, judged, live)
         self._paid += [cost for costs in entry["costs"].values() for cost in costs]
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
