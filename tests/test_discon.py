@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from c_build import COMPILER, library, needs_compiler
-from linear_quadratic import LinearQuadratic
 from printed_commands import TEXTS, blocks, run_code
 from seeds_and_numbers import drawn, seeded
 
@@ -186,22 +185,6 @@ def test_a_library_may_fail_or_warn(tmp_path):
     warns = DISCON(plant, compiled(tmp_path, '{ *fail = 1; strcpy(message, "little oil"); }', "warns"))
     with pytest.warns(UserWarning, match=r"warns\.so: little oil"):
         assert warns.fly(start, wind).actions.shape == (1, 10, 2)
-
-
-@needs_compiler
-def test_what_is_no_library_is_refused(tmp_path):
-    plant, text = WindTurbine(), tmp_path / "text.so"
-    text.write_text("no library")
-    nothing = compiled(tmp_path, "int something(void) { return 1; }", "nothing")
-    for arguments, words in (
-        ((plant, tmp_path / "none.so"), r"library='.*none\.so' of DISCON does not exist"),
-        ((plant, nothing, tmp_path / "DISCON.IN"), r"input_file='.*DISCON\.IN' of DISCON does not exist"),
-        ((plant, text), r"library='.*text\.so' of DISCON cannot be loaded here"),
-        ((plant, nothing), r"library='.*nothing\.so' has no function DISCON"),
-        ((LinearQuadratic(), nothing), "action of a DISCON='generator_torque'.*choose one of force"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            DISCON(*arguments)
 
 
 def test_roscos_controller_flies_our_turbine(capfd):

@@ -8,6 +8,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import run_code
 from seeds_and_numbers import drawn, seeded
 from small_runs import SMALL
+from test_anchored import replays_on
 from test_classical import PD
 from test_collectors import compare, system
 from test_learn import values
@@ -21,6 +22,7 @@ from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.interact import RealFlights
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.plan import MultiStart, WholeEpisodes
 from rt_torchrl.steps.switch import Imitation
@@ -344,3 +346,17 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
     replayed = found.twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
     assert plant.ended(record.states[-1]) and not plant.ended(replayed.states).any()
     assert found.belief.replayed([record], plant.n_steps) < 0.01  # a moment earlier or later hardly costs anything
+
+
+def test_the_anchored_replay_of_an_end_that_noise_hides_costs_what_the_episode_did():
+    """The last reading says that the rod has not fallen; the replay falls one interval later."""
+    plant, policy = Falling(), LinearGain(WEAK)
+    env, closure, actor = rt.PlantEnv(plant, seed=1), plant.make_closure(seeded()), actor_of(plant, policy)
+    flight = RealFlights(env, actor, FlightCollector(env, actor).rollout, plant)
+    flown = flight.fly(policy, strength=0.0, whole=True)
+    states = flown.record.states.clone()
+    states[-1, 0] = 0.99 * states[-1, 0].sign()
+    inputs = continued(flown.record.exogenous, plant.n_steps)[None]
+    replays = replays_on(plant, [flown.record._replace(states=states)], inputs, flown.cost[None], policy, closure)
+    alone = replays.twin.episode_costs(policy, states[:1], inputs)
+    torch.testing.assert_close(replays.corrections(policy), (flown.cost / alone).log(), rtol=0.0, atol=0.05)

@@ -252,6 +252,22 @@ def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_sai
 
 
 @pytest.mark.parametrize(
+    ("algorithm", "order"),
+    [("ddpg", ["critic"] * 7 + ["actor"] * 4), ("td3", ["critic", "both"] * 3 + ["critic"]), ("sac", ["both"] * 7)],
+)
+def test_iterations_come_in_the_order_of_the_method(monkeypatch, algorithm, order):
+    found, kinds = learner(algorithm, critic_iterations=7, actor_iterations=4), []
+    filled(explored(20), found)
+
+    def noted(learner, kind, batch):
+        return lambda *batch: kinds.append(kind) or iteration(learner, kind, *batch)
+
+    monkeypatch.setattr("rt_torchrl.steps.learn.traced", noted)
+    found.update()
+    assert kinds == order
+
+
+@pytest.mark.parametrize(
     ("algorithm", "updates", "spread", "options"),
     [
         # Measured at the end: 0.07 to 0.09 of ‖K*‖.

@@ -128,20 +128,6 @@ def test_a_constant_stands_in_for_an_input_that_is_not_reported():
     assert found["exogenous"].tolist() == [[0.3]]
 
 
-FORGOTTEN = {"state": ("sensors", "encoder"), "exogenous": ("sensors", "wind"), "applied": "motor"}
-
-
-@pytest.mark.parametrize("what", FORGOTTEN)
-def test_a_step_that_does_not_report_what_is_read_is_refused(what):
-    plant = LinearQuadratic(horizon=2.0)
-    rig = Rig(plant)
-    step, rig._step = rig._step, lambda row: step(row).exclude(*[FORGOTTEN[what]] * (rig.count >= 3))
-    system = connected(plant, rig=rig, applied=Reading(keys=("motor",)))
-    with pytest.raises(ValueError, match=f"{what} is read from .*does not report as an array; it has"):
-        system.rollout(20)
-    assert system.env.count == 3
-
-
 def test_a_reading_that_is_not_finite_is_refused():
     """It is refused when it is read; before that, zeros take the place of a report, and may read as anything."""
     plant = LinearQuadratic()

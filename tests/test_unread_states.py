@@ -23,10 +23,8 @@ from rt_torchrl.fit.log import SensorLog
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.config import SafetyConfig
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
-from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
 
@@ -95,21 +93,6 @@ def test_state_feedback_acts_on_readings(kind):
     act = lambda k, t, s, z: controller.act(k * plant.dt, s[:, :2], z)  # noqa: E731
     states, *_ = stepped(plant, plant.closure, state, exogenous, act)
     torch.testing.assert_close(flown.states, states, rtol=1e-5, atol=1e-5)
-
-
-def test_a_safety_layer_sees_readings_alone(tmp_path):
-    plant = real()
-    state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
-    limits = SafetyConfig(interval=plant.dt, log=tmp_path / "log.jsonl")
-    guarded = SafetyLayer(rt.PlantEnv(plant), limits, fallback=lambda reported: torch.zeros(1, 1, dtype=torch.float64))
-    system = RealSystem(guarded, BASE, state=state, exogenous=exogenous, applied=applied)
-    policy = LivePolicy(BASE, LinearGain([[0.3, 0.3]]), ExplorationConfig(), generator=seeded())
-    policy.begin(policy.policy, strength=0.0)
-    episode = EpisodeCollector(system, policy, BASE).rollout()
-    system.close()
-    start = plant.at_rest(episode["state"][:, 0])
-    expected = Rollout(plant, plant.closure)(start, episode["exogenous"], episode["next", "applied"]).states
-    torch.testing.assert_close(episode["next", "state"], expected[:, 1:, :2], rtol=1e-5, atol=1e-5)
 
 
 def test_a_twin_that_holds_what_no_sensor_reads_is_refused(tmp_path):
@@ -183,6 +166,9 @@ def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(
             for p, x in ((plain, flown), (plant, found))
         ]
         torch.testing.assert_close(*costs, rtol=1e-13, atol=1e-13)
+    suspects = rt.StackedObservations(base, 3).suspects()
+    assert suspects.keys() == base.suspects().keys()
+    assert all(suspect.observations == plant.observations for suspect in suspects.values())
 
 
 class Mass(LinearQuadratic):
