@@ -186,11 +186,11 @@ def law_of(twin: DigitalTwin, records: Sequence[Trajectory], uncertainty: Uncert
     output depends on the features.
     """
     features = asked_features(twin, records)
-    visited = features[:: max(1, len(features) // LAW_ROWS)]
-    values = twin.believed_law(visited) if len(visited) else visited
+    values = twin.believed_law(features) if len(features) else features
     places = varying(values)
     if not places:
         return {}
+    visited = features[:: max(1, len(features) // LAW_ROWS)]
     errors = uncertainty.errors_of(lambda: twin.believed_law(visited)[:, places])
     outputs = {
         str(k + 1): {"range": _ends(values[:, k]), "median": error.median().item(), "greatest": error.max().item()}

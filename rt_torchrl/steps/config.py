@@ -158,7 +158,7 @@ class AssimilationConfig:
             :func:`rt_torchrl.fit.sensors.noise_levels`, of more than 1 % of the scatter of what they read.
     """
 
-    iterations: Count = 15
+    iterations: Count = 60
     stop_below: NotNegative = 0.0
     inputs: Literal["realisations", "record"] = "record"
     method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "levenberg_marquardt"
@@ -240,7 +240,7 @@ class TwinningConfig:
 PAPER = TwinningConfig(
     records=1,
     learner=LearnerConfig(algorithm="relaxed_ddpg", critic_iterations=500, actor_iterations=1000, target_rate=0.02),
-    assimilation=AssimilationConfig(method="adam", inputs="realisations", segment=0),
+    assimilation=AssimilationConfig(iterations=15, method="adam", inputs="realisations", segment=0),
     planner=PlannerConfig(method="single_start", iterations=10, realisations=None, descent=DescentConfig()),
     referee=RefereeConfig(rule="decision_tree"),
     hypotheses=HypothesesConfig(which=("none",)),
