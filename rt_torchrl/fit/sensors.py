@@ -47,10 +47,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if self.noise is not None and not 0.0 < self.noise < math.inf:
-            raise ValueError(
-                f"noise={self.noise} of sensor {self.name!r} must be positive and finite [{self.measurement.unit}]; "
-                "None estimates it."
-            )
+            raise ValueError(f"noise={self.noise} of sensor {self.name!r} must be positive, or None to estimate it.")
 
     @property
     def name(self) -> str:

@@ -160,10 +160,7 @@ class Uncertainty:
         errors, nothing = self.standard_errors(), self.unknown()
         warnings = []
         if nothing:
-            warnings.append(
-                f"the data do not tell {', '.join(nothing)}: at most combinations of them are known. Measure more, or "
-                "fix some of them"
-            )
+            warnings.append(f"the data do not tell {', '.join(nothing)}: measure more, or fix some of them")
         for (name, error), value in zip(errors.items(), self.values.tolist(), strict=True):
             if not math.isinf(error) and error > BAD_SHARE * abs(value):
                 warnings.append(

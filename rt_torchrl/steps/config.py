@@ -168,10 +168,7 @@ class AssimilationConfig:
 
     def __post_init__(self) -> None:
         if self.initial == "estimated" and (self.method, self.inputs) != ESTIMABLE:
-            raise ValueError(
-                f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
-                f"are {self.method!r} and {self.inputs!r}."
-            )
+            raise ValueError(f"initial='estimated' needs method, inputs = {ESTIMABLE}, not {self.method, self.inputs}.")
 
 
 @configuration

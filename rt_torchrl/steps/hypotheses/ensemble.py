@@ -53,9 +53,7 @@ class TwinEnsemble(DigitalTwin):
         super().__init__(plant, closure, engine=engine)
         for name, suspect in suspects.items():
             if suspect.readings != plant.states or suspect.dt != plant.dt:
-                raise ValueError(
-                    f"hypothesis {name!r} must extend the twin's plant {plant.name!r}: other states are read."
-                )
+                raise ValueError(f"hypothesis {name!r} must extend the twin's plant {plant.name!r}, which it does not.")
         self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine)}
         for name, suspect in suspects.items():
             self.twins[name] = DigitalTwin(suspect, closures[name], engine=able(engine, suspect))
@@ -161,8 +159,6 @@ def make_twin(plant: Plant, closure: nn.Module, config: HypothesesConfig, *, eng
     device, closures = next((w.device for w in closure.parameters()), torch.device("cpu")), dict[str, nn.Module]()
     for name, suspect in suspects.items():
         if not isinstance(suspect, Extension):
-            raise ValueError(
-                f"hypothesis {name!r} of plant {plant.name!r} must be an Extension, or give a TwinEnsemble."
-            )
+            raise ValueError(f"hypothesis {name!r} of plant {plant.name!r} must be an Extension.")
         closures[name] = suspect.extended(copy.deepcopy(closure)).to(device)
     return TwinEnsemble(plant, closure, suspects, closures, engine=engine)
