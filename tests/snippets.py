@@ -1,7 +1,6 @@
 """Pieces of user code as intervals, from ``data/snippets.txt``; those of several lines stand here."""
 
 import copy
-import io
 import math
 import pickle
 import random
@@ -67,12 +66,6 @@ def by_mask(m, s, d):
     return y * m.w0
 
 
-def out_arg(m, s, d):
-    b = torch.zeros_like(s)
-    torch.add(s, d.exogenous, out=b)
-    return b * m.w0
-
-
 def set_data(m, s, d):
     y = s.clone()
     y.data = s.detach() * 2
@@ -119,22 +112,10 @@ def pivoted(m, s, d):
     return torch.linalg.solve(A, x)[..., :3] * m.w0
 
 
-def asserted(m, s, d):
-    assert s.isfinite().all()
-    return s * m.w0
-
-
 def slope(m, s, d):
     x = s.detach().requires_grad_()
     with torch.enable_grad():
         return torch.autograd.grad((torch.sin(x) * m.w0).sum(), x, create_graph=True)[0]
-
-
-def saved(m, s, d):
-    file = io.BytesIO()
-    torch.save(s.detach(), file)
-    file.seek(0)
-    return torch.load(file) * m.w0
 
 
 class Swish(torch.autograd.Function):

@@ -35,13 +35,6 @@ def test_every_engine_is_timed_and_agrees(tmp_path):
     assert (tmp_path / "wind_turbine.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_a_size_that_would_take_too_long_is_left_out(tmp_path):
-    sizes = ["--plants", "wind_turbine", "--horizons", "20", "600", "--realisations", "2", "--limit", "0.1"]
-    found, _ = rows(tmp_path, RECIPE, *sizes, "--engines", "native", "autograd")
-    assert found.keys() == {("native", 20), ("autograd", 20), ("native", 600)}
-
-
 @pytest.mark.nightly  # minutes of backpropagation
 @pytest.mark.parametrize(
     ("plant", "steps"), [("wind_turbine", 1_200), ("flapping_wing", 10_000), ("cryogenic_tank", 14_400)]

@@ -177,21 +177,6 @@ def test_the_turbine_completes_its_filters():
     assert torch.equal(plant.complete_states(measured, wind[0], flown.actions[0])[:, 2], given)
 
 
-def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
-    """The plant's own steps, without inputs; its noisy angles are read again, and in range."""
-    plant = Pendulum()
-    policy = plant.make_policy(torch.Generator().manual_seed(0))
-    log = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(0))
-    start = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, policy)(start, torch.zeros(1, plant.n_steps, 0).double())
-    # The same steps, of an angle that was wrapped once more: rounding over 200 steps.
-    for k, state in enumerate(plant.states):
-        np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=0, atol=1e-9)
-    noisy = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(0), noise=0.05)
-    assert np.abs(noisy.columns["angle"]).max() <= math.pi and checked(noisy, plant) is noisy
-
-
 # Logs at control intervals: resampling against closed forms, states without a sensor, samples that are missing.
 
 
