@@ -170,10 +170,8 @@ def metrics_of(identified: Identified) -> dict[str, Any]:
 def report_of_parts(parts: resampling.Resampled, plant: rt.Plant, *, rows: int) -> str:
     """The parts and gaps of the log, for the terminal."""
     steps = [len(segment.actions) for segment in parts.segments]
-    lines = [
-        f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
-        f"{plant.dt:g} s in {len(steps)} segments"
-    ]
+    apart = f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%})"
+    lines = [f"{apart}, resampled to {sum(steps)} intervals of {plant.dt:g} s in {len(steps)} segments"]
     lines += [f"  gap from {first:g} to {last:g} s" for first, last in parts.gaps]
     lines += [f"  left out as too short: {first:g} to {last:g} s" for first, last in parts.too_short]
     return "\n".join(lines)

@@ -413,9 +413,9 @@ def merit_lines(controllers: Mapping[str, Any], where: str) -> list[str]:
     if not merits[0]:
         return []
     heading = f"mean (median){where}"
-    lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in controllers)]
+    lines = [f"  {heading:<36}" + "".join(f"{name.replace('_', '-'):>20}" for name in controllers)]
     for name in merits[0]:
-        lines.append(f"    {name:<26}" + "".join(f"{_value(merit[name]):>20}" for merit in merits))
+        lines.append(f"    {name:<34}" + "".join(f"{_value(merit[name]):>20}" for merit in merits))
     return lines
 
 

@@ -108,7 +108,6 @@ class Run:
         self.ended: str | None = None
         self.callbacks = callbacks
         self.device = require_device(config.device)
-        make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         self._real = env if isinstance(env, RealSystem) or env is None else env()
         physics = known_physics(config, plant, self._real, first, baselines).to(self.device)
         laws = dict(baselines or {})
@@ -123,9 +122,8 @@ class Run:
         self._held = RunFolder(config, plant.name, {name: numbers_of(law) for name, law in named.items()})
         self.folder = self._held.path
         try:
-            if self._real is None:
-                make_env = functools.partial(real_side.simulated, plant, config, first, device=self.device)
-            system = self._real or real_side.simulated(plant, config, first, device=self.device)
+            simulated = functools.partial(real_side.simulated, plant, config, first, device=self.device)
+            make_env, system = None if isinstance(env, RealSystem) else env or simulated, self._real or simulated()
             make_learner = learner or functools.partial(ActorCritic, replay=replay)
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector)
             self.unseen = real_side.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)

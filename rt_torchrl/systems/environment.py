@@ -271,8 +271,3 @@ def layers(env: EnvBase) -> Iterator[EnvBase]:
     while isinstance(env, EnvBase):
         yield env
         env = env.base_env if isinstance(env, TransformedEnv) else getattr(env, "env", None)
-
-
-def innermost(env: EnvBase) -> EnvBase:
-    """The system within everything that stands around it."""
-    return next(layer for layer in layers(env) if not isinstance(layer, AroundSystem))

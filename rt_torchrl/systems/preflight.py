@@ -305,10 +305,8 @@ def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
 
 def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
     """Readings beside draws in words."""
-    return (
-        f"between {read.min():.4g} and {read.max():.4g} {signal.unit}, where the plant draws {drawn.min():.4g} to "
-        f"{drawn.max():.4g}"
-    )
+    low, high = drawn.min(), drawn.max()
+    return f"between {read.min():.4g} and {read.max():.4g} {signal.unit}, where the plant draws {low:.4g} to {high:.4g}"
 
 
 def _outside(course: Tensor, read: Tensor, *, widths: float) -> bool:

@@ -17,7 +17,7 @@ from rt_torchrl.export.controller import Controller
 from rt_torchrl.options import array_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.systems.environment import AroundSystem, at_end, at_start, declare_specs, ended_early, innermost, layers
+from rt_torchrl.systems.environment import AroundSystem, at_end, at_start, declare_specs, ended_early, layers
 
 
 def joined(*entries: Tensor) -> Tensor:
@@ -332,8 +332,8 @@ class RealSystem(EnvBase):
         ends = at_end(self.plant, cost, end, last=self._step_count >= self.plant.n_steps)
         if stepped["next", "done"].any() and not ends["done"].any():
             raise ended_early(self._step_count, self.plant)
-        if ends["done"].any() and hasattr(innermost(self.env), "end_episode"):
-            innermost(self.env).end_episode()  # of a simulator that calls its controller, and has more to do
+        if ends["done"].any() and hasattr(self.env, "end_episode"):
+            self.env.end_episode()  # of a simulator that calls its controller, and has more to do
         self._reported = self.env.step_mdp(stepped)
         return self._entries(stepped["next"], end, {"applied": applied} | ends)
 

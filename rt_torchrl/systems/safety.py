@@ -20,7 +20,7 @@ from rt_torchrl.options import array_of, other_units, require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
-from rt_torchrl.systems.environment import AroundSystem, innermost, layers
+from rt_torchrl.systems.environment import AroundSystem, layers
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -239,7 +239,7 @@ class SafetyLayer(AroundSystem):
                 f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
                 "continuous entry 'action'."
             )
-        plant = getattr(innermost(env), "plant", None)
+        plant = getattr(env, "plant", None)
         if isinstance(plant, Plant) and not abs(config.interval - plant.dt) <= ROUNDING * plant.dt:
             raise ValueError(
                 f"interval={config.interval} s must be the control interval of plant {plant.name!r}, {plant.dt:g} s; "
@@ -283,7 +283,7 @@ class SafetyLayer(AroundSystem):
         if faults:
             raise ValueError(f"the system begins with a fault, {faults}, and nothing was sent to it: {dict(reading)}.")
         self._step_count, self._passed, self._last, self._good = 0, 0, None, {}
-        if getattr(innermost(self.env), "reads_applied", False):
+        if getattr(self.env, "reads_applied", False):
             self._last = reading["applied"].clone()  # of a machine in operation
         reading = self._remember(reading)
         if "applied" not in reading:  # the machine need not say what it has applied
@@ -348,7 +348,7 @@ class SafetyLayer(AroundSystem):
         faults = self.watchdog.faults(read, elapsed)
         if missing := [key for key in self._watched if key not in read]:
             faults["missing"] = ", ".join(missing)
-        reasons: dict[str, str] = getattr(innermost(self.env), "reasons", {})  # of a machine that says why
+        reasons: dict[str, str] = getattr(self.env, "reasons", {})  # of a machine that says why
         if reasons and "not finite" in faults:
             faults["not finite"] += f" ({'; '.join(f'{tag}: {why}' for tag, why in reasons.items())})"
         return faults
