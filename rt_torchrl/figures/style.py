@@ -86,9 +86,10 @@ def grid(
 def timeline(
     plant: Plant, intervals: int, count: int, columns: int = 1, **of_grid: Any
 ) -> tuple[Figure, list[Axes], np.ndarray]:
-    """A :func:`grid` over the time of some control intervals, and the times of their ends, from 0 on."""
-    time, label = time_axis(plant, intervals)
-    figure, axes = grid(count, columns, xlabel=label, **of_grid)
+    """A :func:`grid` over control intervals in s, min or h, whichever reads best, and their ends, from 0 on."""
+    unit, length = time_unit(plant.dt * intervals)
+    time = plant.dt / length * np.arange(intervals + 1)
+    figure, axes = grid(count, columns, xlabel=f"time [{unit}]", **of_grid)
     axes[0].set_xlim(0.0, time[-1])
     return figure, axes, time
 
@@ -196,12 +197,6 @@ def draw_groups(
 def closure_look(name: str) -> dict[str, Any]:
     """The look of a closure's curve: ``true``, ``twin`` or ``initial twin``."""
     return {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}
-
-
-def time_axis(plant: Plant, intervals: int) -> tuple[np.ndarray, str]:
-    """Start and ends of control intervals in s, min or h, whichever reads best, and the label of the axis."""
-    unit, length = time_unit(plant.dt * intervals)
-    return plant.dt / length * np.arange(intervals + 1), f"time [{unit}]"
 
 
 def time_unit(seconds: float) -> tuple[str, float]:
