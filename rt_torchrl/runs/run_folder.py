@@ -81,7 +81,7 @@ def plain(value: Any, place: str = "") -> Any:
     )
 
 
-FORMAT = 7
+FORMAT = 8
 KEPT = 3
 """Number of latest checkpoints that are kept."""
 ANEW = "To train anew, choose another folder."
