@@ -11,16 +11,7 @@ from seeds_and_numbers import seeded
 from small_plants import Line, Slope, flown, line_segment, noise_of
 from test_uncertainty import position
 
-from rt_torchrl import (
-    AssimilationConfig,
-    DigitalTwin,
-    Measurement,
-    PositiveCoefficients,
-    Rollout,
-    Sensor,
-    sensor_record,
-    sensors_of,
-)
+import rt_torchrl as rt
 from rt_torchrl.fit.least_squares import Estimation, judged
 from rt_torchrl.fit.sensors import known_sensors, read, read_slopes, segments
 from rt_torchrl.steps.assimilate import Assimilation
@@ -31,10 +22,10 @@ def test_derivatives_are_those_of_backpropagation():
     """Of a nonlinear sensor with a bias, over records of two lengths with holes, against the adjoint's."""
     plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
     read_product = lambda plant, t, s, z: s[..., 0] * s[..., 1] + t + z[..., 0]  # noqa: E731
-    product = Measurement(symbol="p", name="product", unit="m^2/s", read=read_product)
-    sensors = (*sensors_of(plant, ["position"]), Sensor(measurement=product, bias=True))
-    twin = DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
-    records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (12, 7))]
+    product = rt.Measurement(symbol="p", name="product", unit="m^2/s", read=read_product)
+    sensors = (*rt.sensors_of(plant, ["position"]), rt.Sensor(measurement=product, bias=True))
+    twin = rt.DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
+    records = [rt.sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (12, 7))]
     records[0].readings[3:5, 0] = math.nan
     spread = torch.tensor([math.inf, 2.0]).double()
     task = Estimation(twin, sensors, spread=spread)
@@ -62,10 +53,10 @@ def test_derivatives_are_those_of_backpropagation():
 def test_a_line_with_holes_is_fitted_as_by_regression():
     """Weights, starts, noise level and standard errors of two records of unequal length, against least squares."""
     times, X, y, records = 0.1 * np.arange(60), np.zeros((100, 4)), np.zeros(100), []
-    sensors = sensors_of(Line(), ["position"])
+    sensors = rt.sensors_of(Line(), ["position"])
     for k, (n, wind) in enumerate(((60, 1.0), (40, -2.0))):
         values = 2.0 + 0.5 * times[:n] + 0.3 * wind * times[:n] + 0.2 * noise_of(n, n)
-        record = sensor_record(Line(), sensors, line_segment(values, wind=wind))
+        record = rt.sensor_record(Line(), sensors, line_segment(values, wind=wind))
         record.readings[5:15] = math.nan
         records.append(record)
         rows = slice(0, 60) if k == 0 else slice(60, 100)
@@ -75,7 +66,7 @@ def test_a_line_with_holes_is_fitted_as_by_regression():
     level = math.sqrt(residual[0] / (80 - 4))
     errors = level * np.sqrt(np.diag(np.linalg.inv(X[kept].T @ X[kept])))
     closure = Slope()
-    found = Estimation(DigitalTwin(Line(), closure), sensors).run(records)
+    found = Estimation(rt.DigitalTwin(Line(), closure), sensors).run(records)
     # The descent ends where J can fall by 1e-8 of it; the noise level rests within one per cent.
     np.testing.assert_allclose(list(found.after.values()), solution[2:], atol=1e-3 * errors[2:].min())
     np.testing.assert_allclose(found.initial[:, 0].numpy(), solution[:2], atol=1e-3 * errors[:2].min())
@@ -91,12 +82,12 @@ def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
     class Saturating(LinearQuadratic):
         position, velocity = LinearQuadratic.states
         measurements = (
-            Measurement.of(position, lambda plant, t, state, exogenous: state[..., 0].clamp(-0.5, 0.5)),
-            Measurement.of(velocity),
+            rt.Measurement.of(position, lambda plant, t, state, exogenous: state[..., 0].clamp(-0.5, 0.5)),
+            rt.Measurement.of(velocity),
         )
 
     plant = Saturating()
-    sensors, states = sensors_of(plant, ["position", "velocity"]), torch.tensor([[2.0, 3.0], [0.25, 4.0]]).double()
+    sensors, states = rt.sensors_of(plant, ["position", "velocity"]), torch.tensor([[2.0, 3.0], [0.25, 4.0]]).double()
     given = plant, torch.zeros(2).double(), states, torch.zeros(2, 1).double()
     assert read(sensors, *given).tolist() == [[0.5, 3.0], [0.25, 4.0]]
     slopes = read_slopes(sensors, plant, *(x[None] for x in given[1:]))
@@ -114,7 +105,7 @@ def test_the_example_of_the_documentation_runs():
 
 
 def test_parts_of_a_record_share_no_sample():
-    record = sensor_record(Line(), position(), line_segment(np.arange(25.0), start=2.0))
+    record = rt.sensor_record(Line(), position(), line_segment(np.arange(25.0), start=2.0))
     parts = segments(record, 10, 0.1)
     assert [len(part.actions) for part in parts] == [10, 10, 4]
     assert sum(int(part.seen.sum()) for part in parts) == 25
@@ -129,7 +120,7 @@ WINDS = (1.0, -2.0)
 
 def assimilation(plant, closure, **options):
     options = {"inputs": "record", "method": "levenberg_marquardt", "initial": "estimated", "iterations": 30, **options}
-    return Assimilation(DigitalTwin(plant, closure), AssimilationConfig(**options))
+    return Assimilation(rt.DigitalTwin(plant, closure), rt.AssimilationConfig(**options))
 
 
 def lines():
@@ -210,7 +201,7 @@ def test_segments_start_at_their_own_time_and_state():
     for record in records:
         for first in range(0, 48, 12):
             part = slice(first, first + 12)
-            rollout = Rollout(plant, closure)
+            rollout = rt.Rollout(plant, closure)
             piece = record.states[None, first : first + 13]
             given = piece[:, 0], record.exogenous[None, part], record.actions[None, part]
             expected.append(identification_cost(plant, rollout(*given, start=first * plant.dt), piece).item())
@@ -219,7 +210,7 @@ def test_segments_start_at_their_own_time_and_state():
     assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
 
 
-class NamedSlope(PositiveCoefficients):
+class NamedSlope(rt.PositiveCoefficients):
     """ẋ = w, a slope with a name."""
 
     names = {"slope": "m/s"}

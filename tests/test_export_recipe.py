@@ -84,10 +84,6 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
         ({"role": "oracle"}, "role='oracle' does not exist in this run; choose model_based or model_free"),
         ({"formats": ()}, r"formats=\(\) must be some of c, onnx, discon"),
         ({"what": ("plant",)}, r"what=\('plant',\) must be some of policy, controller, twin"),
-        (
-            {"what": ("policy", "twin"), "formats": ("onnx",)},
-            r"formats=\('onnx',\) holds no format of the twin; add c\.",
-        ),
         ({"what": ("policy", "controller"), "formats": ("onnx",)}, r"no format of the controller; add c or discon\."),
         ({"what": ("controller",), "formats": ("c", "onnx")}, "no onnx of controller can be written; leave it out"),
         ({"recipe": Path("nowhere.py")}, "nowhere.py does not exist"),

@@ -1,7 +1,6 @@
 """Figures against the numbers they are drawn from, on snapshots of short trainings and on flights."""
 
 import copy
-import math
 import sys
 from dataclasses import replace
 
@@ -21,12 +20,9 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing import figures as drone_figures
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine import figures as turbine_figures
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.unknown import unknown
-from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures import flights
 from rt_torchrl.figures.style import ROLES
 from rt_torchrl.figures.training import RESOLUTION, closure_weights, visited_observations
@@ -97,13 +93,6 @@ def test_states_are_record_and_replay_with_units_and_residual(name, request):
     assert "time [s]" in draw(figure)
 
 
-def test_an_error_of_a_whole_turn_is_none(oscillator):
-    plant, turn = copy.deepcopy(oscillator.plant), {"low": -math.pi, "high": math.pi, "periodic": True}
-    plant.states = tuple(replace(signal, **turn) for signal in plant.states)
-    turned = replace(oscillator, plant=plant, replay=oscillator.record.states + 2.0 * math.pi)
-    assert [ax.get_title(loc="right") for ax in figures.states(turned).axes] == ["RMS 0 m", "RMS 0 m/s"]
-
-
 def test_exogenous_shows_record_mean_and_samples(turbine):
     above, below = figures.exogenous(turbine).axes
     assert same(line(above, "recorded"), turbine.record.exogenous[:, 0])
@@ -152,13 +141,7 @@ def test_learning_curves_and_timeline(oscillator):
     assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([1, 2, 3, 4], [4.0, 3.0, 2.0, 1.0])
     # J_a spans less than a decade and J_p spans three.
     assert (control.get_yscale(), identification.get_yscale()) == ("linear", "log")
-    spans = [
-        [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in bars.get_paths()]
-        for bars in strip.collections
-        if bars.get_alpha() == 1.0
-    ]
     assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
-    assert spans == [[(0.5, 1.5), (1.5, 2.5)], [(2.5, 3.5), (3.5, 4.5)]]
     assert "Policies after episode 4" in str(draw(figures.policy_contours(replace(oscillator, episodes=episodes))))
     assert draw(figure)
 
@@ -196,27 +179,6 @@ def flown(plant, count=1, n=40):
         return Rollout(plant, plant.closure, policy)(start, plant.draw_exogenous(count, generator)[:, :n])
 
 
-def held(plant, one):
-    return plant.setpoints(one.states[:, :-1], one.actions, one.exogenous)
-
-
-def test_setpoints_are_what_the_costs_follow():
-    turbine = WindTurbine(horizon=20.0)
-    one = flown(turbine, 3)
-    speed, wanted = held(turbine, one)["generator speed [rad/s]"]
-    torch.testing.assert_close(speed, 97.0 * one.states[:, :-1, 0])
-    assert wanted.max() <= 122.92 and held(turbine, one)["power [MW]"][1].max() <= 5.3  # the rated speed, 1173.7 rpm
-    real = unknown(turbine, ("pitch",))  # an extended plant has the setpoints of its base
-    assert list(held(real, flown(real))) == list(held(turbine, one))
-    tank = CryogenicTank(horizon=3000.0)
-    pressure, wanted = held(tank, flown(tank))["pressure [kPa]"]
-    torch.testing.assert_close(pressure, 1e-3 * flown(tank).states[:, :-1, 2])
-    assert (wanted == 500.0).all()
-    drone = FlappingWing(horizon=0.05, target=(2.0, 3.0))
-    assert [held(drone, flown(drone))[name][1].unique().item() for name in ("x [m]", "z [m]")] == [2.0, 3.0]
-    assert held(Pendulum(), flown(Pendulum())) == {}
-
-
 def test_every_controller_is_drawn_and_the_setpoint_once():
     plant = WindTurbine(horizon=20.0)
     one = flown(plant)
@@ -229,30 +191,6 @@ def test_every_controller_is_drawn_and_the_setpoint_once():
     assert speed.get_ydata() == pytest.approx(97.0 * other.states[0, :-1, 0].numpy())
     assert matplotlib.colors.same_color(figure.axes[0].lines[0].get_color(), ROLES["model_based"])
     assert figure.axes[2].lines[0].get_ydata() == pytest.approx(one.actions[0, :, 0].numpy())
-
-
-COUNT = 12
-
-
-def judged(*names):
-    generator = torch.Generator().manual_seed(0)
-    values = {name: torch.rand(2, COUNT, generator=generator, dtype=torch.float64) + 0.1 for name in names}
-    return {name: Judged(costs, {"final distance [m]": 100.0 * merit}) for name, (costs, merit) in values.items()}
-
-
-def test_every_episode_is_a_point_and_every_mean_a_bar():
-    found = judged("model_based", "model_free", "PD")
-    figure = figures.unseen(found)
-    draw(figure)
-    assert len(figure.axes) == 2
-    for ax, pick in zip(figure.axes, ("costs", "merit"), strict=True):
-        shown = [line for line in ax.lines if line.get_marker() == "o"]
-        bars = [line for line in ax.lines if line.get_marker() == "None"]
-        for column, (who, values) in enumerate(found.items()):
-            expected = values.control_costs if pick == "costs" else values.merit["final distance [m]"]
-            assert np.array_equal(shown[column].get_ydata(), expected)
-            assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
-            assert (np.abs(shown[column].get_xdata() - column) < 0.3).all()
 
 
 # The tank's figures against the numbers they are drawn from, on six hours in orbit.

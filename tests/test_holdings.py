@@ -145,10 +145,3 @@ def test_damaged_code_is_made_again(damage, folder, compilations):
     kept.write_bytes(damages[damage])
     assert stored(1.0) == 1.0
     assert len(compilations) == 2 and kept.read_bytes() == whole
-
-
-def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, compilations):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr(machine_code, "cache_folder", lambda: tmp_path / "file" / "native")
-    assert stored(1.0) == stored(1.0) == 1.0
-    assert len(compilations) == 2

@@ -11,16 +11,7 @@ from seeds_and_numbers import drawn, stepped
 from small_runs import SMALL, small_run
 from test_export_recipe import recipe
 
-from rt_torchrl import (
-    BiasedSensor,
-    DigitalTwin,
-    ExtendedClosure,
-    RunConfig,
-    configuration,
-    control_cost,
-    export_twin,
-    load_run,
-)
+import rt_torchrl as rt
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.c_file import c_array
@@ -97,7 +88,7 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
 def test_hidden_states_follow_from_what_was_read():
     real = LaggedActuator(PLANT, "force", LAG)
     record, states = recorded(real)
-    twin = DigitalTwin(real, real.closure)
+    twin = rt.DigitalTwin(real, real.closure)
     torch.testing.assert_close(twin.followed(record), states, rtol=1e-12, atol=1e-12)
     wild = record._replace(exogenous=record.exogenous + 1e308, actions=record.actions * 1e308)
     with pytest.raises(DivergenceError, match="is not finite"):
@@ -109,7 +100,7 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
     """The oracle replays every segment from readings and hidden states, which the same closure gives."""
     real = LaggedActuator(PLANT, "force", LAG)
     record, _ = recorded(real)
-    twin = DigitalTwin(real, ExtendedClosure(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), real.closure.own))
+    twin = rt.DigitalTwin(real, rt.ExtendedClosure(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), real.closure.own))
     reading, again = twin.of(Reread(real)), reread(record, real, 20)
     flown = reading.replay(again.states[None, 0], again.exogenous[None], again.actions[None]).states[0]
     for first in range(0, 100, 20):
@@ -163,7 +154,7 @@ def test_an_episode_reports_the_twin_that_is_believed():
 def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
     """The hypothesis that is right replays any segments exactly, in a training, its figures and on unseen episodes."""
     real = LaggedActuator(PLANT, "force", LAG)
-    (record, states), twin = recorded(real), DigitalTwin(real, real.closure)
+    (record, states), twin = recorded(real), rt.DigitalTwin(real, real.closure)
     fit, unseen = Fit(twin, ASSIMILATION, 2), UnseenEpisodes(real, 2)
     for fit.whole.length in (0, 7, 25):
         assert fit.cost([record]) < 1e-20 and max(fit.whole.rms_errors(fit.rested([record])).values()) < 1e-10
@@ -241,8 +232,8 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
 def test_hypotheses_are_chosen_by_name():
     twin, _ = ensemble(PLANT, which=("late",))
     assert list(twin.twins) == [ALONE, "late"]
-    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which=("none",)))) is DigitalTwin
-    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is DigitalTwin
+    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which=("none",)))) is rt.DigitalTwin
+    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is rt.DigitalTwin
 
 
 # What is said of a twin with hypotheses is said of the likeliest one: simulations, results, exports and prices.
@@ -251,8 +242,8 @@ def test_hypotheses_are_chosen_by_name():
 SHORT_LAG = 0.35
 
 
-@configuration
-class Config(RunConfig):
+@rt.configuration
+class Config(rt.RunConfig):
     """A system whose actuator lags, and a twin that suspects lag and dead time."""
 
     def plant(self):
@@ -270,7 +261,7 @@ def run(tmp_path_factory):
     hypotheses = HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
     small_run(folder, 1, Config().plant(), config=Config, twinning=twinning).train()
-    return load_run(folder, Config)
+    return rt.load_run(folder, Config)
 
 
 def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
@@ -285,8 +276,9 @@ def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
     assert torch.equal(run.simulate(policy, z, expected[0], on="twin").states, flown.states)
     batch = start.expand(1, 2), z[None]
     simulated = run.simulate(policy, batch[1], batch[0], on="twin")
-    torch.testing.assert_close(control_cost(believed.plant, simulated).mean(), run.twin.cost(policy, *batch).detach())
-    alone = DigitalTwin(run.physics, run.closure).control(policy, *batch).states[0]
+    cost = run.twin.cost(policy, *batch).detach()
+    torch.testing.assert_close(rt.control_cost(believed.plant, simulated).mean(), cost)
+    alone = rt.DigitalTwin(run.physics, run.closure).control(policy, *batch).states[0]
     assert (alone - flown.states[:, :2]).abs().max() > 1e-3
 
 
@@ -301,7 +293,7 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
     unseen_J_p = summary["unseen"]["J_p"]["mean"]
     flown = run.simulate(run.policy(run.live), seed=5)
     misfits = {}
-    for name, twin in (("lags", believed), (ALONE, DigitalTwin(run.physics, run.closure))):
+    for name, twin in (("lags", believed), (ALONE, rt.DigitalTwin(run.physics, run.closure))):
         start = twin.plant.at_rest(flown.states[0, :2])
         states, *_ = stepped(twin.plant, twin.closure, start, flown.exogenous, lambda k, t, s, w: flown.actions[k])
         misfits[name] = twin.plant.dt * run.physics.discrepancy(states[1:, :2], flown.states[1:, :2]).sum().item()
@@ -316,7 +308,7 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
 @needs_compiler
 def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, monkeypatch):
     export = recipe("export")
-    monkeypatch.setattr(export.rt, "load_run", lambda folder, given: load_run(folder, Config))
+    monkeypatch.setattr(export.rt, "load_run", lambda folder, given: rt.load_run(folder, Config))
     export.main(export.Config(run=run.folder, what=("twin",), output=tmp_path, name="it"))
     assert "the twin with lags, which explains the records best" in capsys.readouterr().out
 
@@ -324,14 +316,14 @@ def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, mon
 @needs_compiler
 def test_unread_states_are_started_in_c(tmp_path):
     """An actuator at rest stands at zero; a sensor's bias shows from the first interval on."""
-    plant = BiasedSensor(LaggedActuator(LinearQuadratic(), "force", SHORT_LAG), "position", 0.5, scale=1.0)
+    plant = rt.BiasedSensor(LaggedActuator(LinearQuadratic(), "force", SHORT_LAG), "position", 0.5, scale=1.0)
     closure = plant.extended(LinearClosure([[0.05, 0.0], [-0.4, 0.2]]))
-    assert export_twin(closure, tmp_path / "it.c", plant, name="it") < 1e-9
+    assert rt.export_twin(closure, tmp_path / "it.c", plant, name="it") < 1e-9
     assert "void it_rest(const double *read, double *state);" in (tmp_path / "it.h").read_text()
     states = c_array([0.7, -0.4, 9.0, 9.0])
     library(tmp_path / "it.c").it_rest(states, states)
     assert list(states) == pytest.approx([0.7, -0.4, 0.0, 0.5], abs=1e-12)
-    export_twin(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), tmp_path / "plain.c", LinearQuadratic(), name="plain")
+    rt.export_twin(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), tmp_path / "plain.c", LinearQuadratic(), name="plain")
     assert "_rest" not in (tmp_path / "plain.h").read_text()
 
 
@@ -343,7 +335,7 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
     start, z = drawn(plant, 2)
     controller = PredictiveControl(plant, twin.closure, PredictiveConfig(horizon=0.5, forecast="held"))
     alone, late = (
-        control_cost(one.plant, controller.fly(one.plant.at_rest(start), z, one.closure, plant=one.plant))
+        rt.control_cost(one.plant, controller.fly(one.plant.at_rest(start), z, one.closure, plant=one.plant))
         for one in (twin.twins[ALONE], twin.twins["late"])
     )
     assert not torch.allclose(alone, late)

@@ -1,7 +1,5 @@
 """``recipes/paper.py``, the paper's algorithm on one screen, and the preset of the same name."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -55,11 +53,3 @@ def test_the_figures_of_the_paper_are_drawn_beside_its_numbers(plant, tmp_path, 
     metrics[0]["episodes"][0] |= {"J_p": None, "J_p_before": None}
     metrics[0]["summary"]["J_p_ratio"] = None
     assert "J_p: nan" in recipe.table(plant, metrics) and recipe.learning(plant, metrics)
-
-
-@pytest.mark.slow
-def test_it_runs_as_printed():
-    done = subprocess.run(
-        [sys.executable, RECIPES / "paper.py", "--episodes", "1"], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.startswith("episode 1: real_cost ") and done.stdout.endswith("keep\n")

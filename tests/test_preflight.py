@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from faulty_system import as_reported
 from small_runs import SMALL
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
@@ -258,22 +257,6 @@ def test_a_reading_that_stands_still_where_the_twin_moves_is_named(column):
     with pytest.raises(rt.WiringError, match=words) as raised:
         found.require()
     assert "it does not move" in str(raised.value)
-
-
-class Sparse(rt.PlantEnv):
-    """A plant of whose readings every fifth is lost."""
-
-    def _step(self, tensordict):
-        found = super()._step(tensordict)
-        if self._step_count % 5 == 0:
-            found["state"] = torch.full_like(found["state"], math.nan)
-        return found
-
-
-def test_intervals_that_begin_or_end_with_a_refused_reading_show_nothing():
-    guarded = rt.SafetyLayer(Sparse(PENDULUM, seed=1), rt.SafetyConfig(interval=PENDULUM.dt), fallback=(0.0,))
-    found = rt.check_real_system(as_reported(guarded, PENDULUM, exogenous=()), PENDULUM)
-    assert not found.mistakes and (found.present.share < 1e-12).all()
 
 
 def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():

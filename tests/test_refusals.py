@@ -19,17 +19,7 @@ from test_study import TINY
 from torch import nn
 from traced_function import sections
 
-import rt_torchrl
-from rt_torchrl import (
-    ConnectedPlant,
-    ModbusLink,
-    PlannerConfig,
-    PredictiveConfig,
-    PredictiveControl,
-    RecedingHorizon,
-    Register,
-    Rollout,
-)
+import rt_torchrl as rt
 from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.wind_turbine import unknown as turbines
@@ -95,7 +85,7 @@ def studied(**options):
 
 def modbus(**options):
     client = pytest.importorskip("pymodbus.client").ModbusTcpClient("127.0.0.1", **options)
-    return ModbusLink(client, {"a": Register(0)}, {"b": Register(4)})
+    return rt.ModbusLink(client, {"a": rt.Register(0)}, {"b": rt.Register(4)})
 
 
 def law(method=PD.law, **own):
@@ -112,14 +102,14 @@ def still(**options):
 
 def client(entries=None, commands=("command.force",), **options):
     entries = {"state": ("position", "velocity")} if entries is None else entries
-    return ConnectedPlant(None, entries, commands, LQ.actions, **{"period": 0.1} | options)
+    return rt.ConnectedPlant(None, entries, commands, LQ.actions, **{"period": 0.1} | options)
 
 
 def RECEDING(seconds):
-    return PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=seconds))
+    return rt.PlannerConfig(method="receding_horizon", receding_horizon=rt.PredictiveConfig(horizon=seconds))
 
 
-MPC = PredictiveControl(LQ, LQ.closure, PredictiveConfig(horizon=1.0))
+MPC = rt.PredictiveControl(LQ, LQ.closure, rt.PredictiveConfig(horizon=1.0))
 
 
 def wind_record(time, speed):
@@ -131,7 +121,7 @@ def ramp(duration):
 
 
 def horizon(**options):
-    return RecedingHorizon(LQ, LQ.closure, PredictiveConfig(**options))
+    return rt.RecedingHorizon(LQ, LQ.closure, rt.PredictiveConfig(**options))
 
 
 def flight(*, policy=None, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1), spoil=None, **options):
@@ -139,21 +129,21 @@ def flight(*, policy=None, state=(2, 2), exogenous=(2, 50, 1), command=(2, 50, 1
     values |= {} if command is None else {"command": zeros(*command)}
     if spoil:
         values[spoil].flatten()[3] = math.nan
-    return Rollout(LQ, LQ.closure, policy, **options)(**values)
+    return rt.Rollout(LQ, LQ.closure, policy, **options)(**values)
 
 
 class Names(dict):
     """The names of this file, and all of the library by need."""
 
     def __missing__(self, name):
-        for module in (rt_torchrl, *(importlib.import_module(f"rt_torchrl.{one}") for one in MODULES)):
+        for module in (rt, *(importlib.import_module(f"rt_torchrl.{one}") for one in MODULES)):
             if hasattr(module, name):
                 return getattr(module, name)
         raise KeyError(name)
 
 
 HERE = Names(globals())
-LAGGED = HERE["LAGGED"] = rt_torchrl.LaggedActuator(LQ, "force", 0.4)
+LAGGED = HERE["LAGGED"] = rt.LaggedActuator(LQ, "force", 0.4)
 READ_BY_THE_TABLE = TensorDict, WIND, LinearClosure, Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
 
 

@@ -60,26 +60,6 @@ def cheapest(policies, episodes):
     return min(policies, key=lambda role: stepped_cost(episodes, policies[role]))
 
 
-# The closure's weights on the terminal.
-
-
-ROD = {"a": {"unit": "kg", "meaning": "mass of the rod"}}
-
-
-def test_weights_are_shown_with_what_is_known_of_them():
-    names = ("a", "b", "c")
-    start, found = dict(zip(names, (1.0, 2.0, 3.0), strict=True)), dict(zip(names, (1.5, 2.5, 3.0), strict=True))
-    closure = {"start": start, "found": found, "described": ROD, "true": {"a": 1.25}}
-    lines = results.closure_lines(closure, errors={"a": 0.25, "b": None, "c": 0.0})
-    assert [" ".join(line.split()) for line in lines] == [
-        "closure weight start found std. error true",
-        "a [kg] 1 1.5 0.25 1.25 mass of the rod",
-        "b 2 2.5 - -",
-        "c 3 3 fixed -",
-        "std. error -: the records say nothing of the weight alone, at most of combinations with others",
-    ]
-
-
 # The bar of a training says what is under way.
 
 

@@ -184,13 +184,6 @@ def test_a_twin_is_planned_on_with_the_closure_it_has_now(change):
     assert torch.equal(found, fresh) and (change == "a frozen weight" or not torch.equal(found, before))
 
 
-def test_a_policy_in_single_precision_is_refused_also_later():
-    twin, policy, episodes = twin_and_policy()
-    twin.cost(policy, *episodes)
-    with pytest.raises(ValueError, match="torch.float32"):
-        twin.cost(policy.float(), *episodes)
-
-
 # Forward sensitivities and Levenberg-Marquardt against backpropagation and known minima
 
 
