@@ -217,7 +217,7 @@ class ReinforcementTwinning(TensorDictSequential):
             episode.set_non_tensor("live", self.referee.live)
         steps: dict[str, Callable[[TensorDictBase], TensorDictBase]] = dict(self.module.items())
         if self.first is not None and not self.episodes_done:
-            steps = {"start": partial(self._start, tell=tell)} | steps
+            steps = {"start": partial(self.start, tell=tell)} | steps
         self.flights.faults = []
         for name, step in steps.items():
             safe_point()
@@ -227,7 +227,7 @@ class ReinforcementTwinning(TensorDictSequential):
             episode["seconds", name] = time.perf_counter() - start
         return episode
 
-    def _start(self, episode: TensorDictBase, *, tell: Callable[[str], None]) -> TensorDictBase:
+    def start(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda part: None) -> TensorDictBase:
         """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
         assert self.first is not None
         pupils = self.first.take(self.policies, self.twin.closure)
