@@ -21,7 +21,7 @@ from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 
 def flown_on(real, policy, physics, *, seed=0, count=2):
@@ -337,3 +337,28 @@ def test_plans_on_expected_costs_find_what_the_twin_alone_does_not():
         )
     )
     assert torch.allclose(expected, true, rtol=1e-6) and not torch.allclose(alone, true, rtol=0.05)
+
+
+def virtual_episodes(physics, count=20):
+    generator = torch.Generator().manual_seed(99)
+    return Scenario(physics.draw_initial_state(count, generator), physics.draw_exogenous(count, generator))
+
+
+def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
+    real, physics = pushed(horizon=2.0)
+    (record,), _, cost = flown_on(real, LinearGain([[0.5, 0.5]]), physics, count=1)
+    belief, wild = belief_of([], real, physics), LinearGain([[-1e40, 0.0]])
+    belief.append(record, "model_based", cost.item(), weights=wild.state_dict())
+    assert belief.contradicted and belief.anchors() is None and [flight.d for flight in belief.compared()] == [5.0]
+    assert belief.expected(wild, 1.0) == pytest.approx(math.exp(5.0 + 0.5 * NOISE**2))
+    assert belief.expected(LinearGain([[0.5, 0.5]]), 1.0) == 1.0
+
+
+def test_the_best_that_flew_is_found_whatever_was_computed_before():
+    gains, episodes = [(2.0, 0.5), (0.5, 0.5), (1.0, 0.5)], virtual_episodes(LinearQuadratic())
+    fresh, warm, like = belief_of(gains), belief_of(gains), LinearGain([[0.0, 0.0]])
+    warm.anchors()
+    (weights, judged), (same, again) = fresh.best_flown(like, episodes), warm.best_flown(like, episodes)
+    assert judged == again and torch.equal(weights["gain"], same["gain"])
+    policy = LinearGain(weights["gain"].tolist())
+    assert warm.judge(policy, episodes).expected == pytest.approx(judged.expected, rel=1e-12)

@@ -273,3 +273,15 @@ def test_outside_the_range_everything_is_nan_and_check_raises(p):
     with pytest.raises(ValueError, match="Hydrogen, 80 … 900 kPa"):
         fit.check(double(p, 500e3))
     fit.check(double(LOW, HIGH))
+
+
+def test_derivatives_of_values_and_slopes():
+    fit = Saturation()
+    sizes = torch.stack(fit(double(HIGH)), -1).abs()
+
+    def scaled(log_p):
+        values, slopes = fit.with_slopes(log_p.exp())
+        return torch.stack(values, -1) / sizes, torch.stack(slopes, -1) / sizes * HIGH
+
+    log_p = torch.linspace(math.log(LOW) + 0.01, math.log(HIGH) - 0.01, 7, dtype=torch.float64)
+    assert torch.autograd.gradcheck(scaled, log_p.requires_grad_())

@@ -11,10 +11,13 @@ from c_build import COMPILER, library, needs_compiler
 from printed_commands import TEXTS, blocks, run_code
 from seeds_and_numbers import drawn, seeded
 
-from rt_torchrl import DISCON, SaturatedAffine, export_discon
+from rt_torchrl import DISCON, SaturatedAffine, StateFeedback, export_discon
+from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.controller import Controller
+from rt_torchrl.trajectories.state_feedback import Remembering
 
 N_G = 97.0
 HALF = 2.0**-24
@@ -209,3 +212,17 @@ def test_the_code_of_the_page_prints_what_it_says(capfd):
         assert f"prints {cost}" in TEXTS["discon.md"]
         run_code("discon.md", code.replace("dt=0.1", f"dt={dt}"))
         assert f"tensor({cost}, dtype=torch.float64)" in capfd.readouterr().out
+
+
+def test_a_controller_by_a_library_is_judged_as_a_classical_one(scheduled):
+    """A training takes a class; none of its flights is compiled, because the library is no function of a memory."""
+    plant = WindTurbine(observe=("scheduled",), horizon=20.0)
+
+    class Ours(DISCON):
+        def __init__(self, plant):
+            super().__init__(plant, scheduled[2])
+
+    require_controller("baselines['ours']", Ours, plant)
+    controller, unseen = Ours(plant), UnseenEpisodes(plant, 2)
+    assert isinstance(controller, StateFeedback) and not isinstance(controller, Remembering)
+    assert unseen.judge(unseen.fly(controller)).control_costs.isfinite().all()

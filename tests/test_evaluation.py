@@ -12,13 +12,14 @@ from small_runs import small_run, stepped_cost
 
 from rt_torchrl import SaturatedAffine, SaturatedMLP, StickingActuator
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.results import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
-from rt_torchrl.trajectories.rollout import ENGINES
+from rt_torchrl.trajectories.rollout import ENGINES, DivergenceError
 
 
 def test_excesses_over_bounds_by_hand():
@@ -106,3 +107,26 @@ def test_an_engine_whose_gradient_is_another_one_trains_nothing(engine, tmp_path
     ):
         run.train()
     assert not run.episodes
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(5))
+def test_the_engineering_task_beats_jonkman_in_all_his_merits(seed):
+    """On unseen episodes: his energy, at most 1.5 times his pitch travel, and a fifth less speed above rated."""
+    plant = WindTurbine(cost=EngineeringCost(), observe=("measured+wind",))
+    found = optimum(plant, PERCEPTRON, 300, 200, polish=0, seed=seed)
+    unseen = UnseenEpisodes(plant, 16, seed=999)
+    with torch.no_grad():
+        ours, his = (unseen.judge(unseen.fly(law)).merit for law in (found.policy, JonkmanController(plant)))
+    names = ("mean power [MW]", "pitch travel [deg/s]", "speed above rated [rad/s]")
+    power, travel, over = (ours[name].mean().item() / his[name].mean().item() for name in names)
+    assert power >= 1.0 and travel <= 1.5 and over <= 0.8
+
+
+def test_a_start_under_which_the_plant_diverges_is_a_dear_one():
+    unseen, gains = UnseenEpisodes(LinearQuadratic(noise=0.0), 4), iter([1e200, 0.5, 1e200])
+    search = {"iterations": 5, "few": 2, "polish": 2}
+    found = exact_optimum(unseen, lambda _: LinearGain([[next(gains)] * 2]), starts=2, **search)
+    assert found.costs[0] == math.inf and found.cost <= found.by_gradients < math.inf
+    with pytest.raises(DivergenceError, match="under each of the 1 first policies"):
+        exact_optimum(unseen, lambda _: LinearGain([[next(gains)] * 2]), starts=1, **search)

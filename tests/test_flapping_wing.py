@@ -192,3 +192,13 @@ def test_trim_in_a_headwind_of_one_metre_per_second(plant):
 def test_strongest_headwind_that_can_be_held(plant):
     _, wind = fsolve(lambda a: mean_force(plant, a[0], -30.0, a[1]) - [0.0, 1.0], [77.0, 2.0])
     assert wind == pytest.approx(2.55, abs=0.01)
+
+
+def test_a_heavier_body_is_moved_by_the_same_forces(plant):
+    state, action, wind = double(0.0, 0.0, 0.3, -0.2), double(77.0, -5.0), double(1.0)
+    heavier = FlappingWing(mass=1.25 * MASS)
+    one, other = (
+        p.vector_field(double(0.01).squeeze(), state, action, wind, plant.closure)[2:] for p in (plant, heavier)
+    )
+    gravity = double(0.0, -GRAVITY)
+    torch.testing.assert_close(1.25 * (other - gravity), one - gravity)

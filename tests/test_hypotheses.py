@@ -340,3 +340,24 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
     )
     assert not torch.allclose(alone, late)
     torch.testing.assert_close(twin.episode_costs(controller, start, z), 0.25 * alone + 0.75 * late)
+
+
+def test_the_state_is_kept():
+    """What goes on from it makes the same of the next record, in as many rounds."""
+    twin, assimilation = ensemble(PLANT, call=0.05)
+    record, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    assimilation.update([record])
+    assert assimilation.explain(0.06)
+    other, resumed = ensemble(PLANT, call=0.05)
+    other.load_hypotheses(twin.state_dict()["hypotheses"])
+    other.closure.load_state_dict(twin.closure.state_dict())
+    resumed.load_state_dict(assimilation.state_dict())
+    # The hopeless one waits; the other one is fitted, and in fewer rounds than the first time.
+    assert resumed.called and resumed.turns["late"].waiting == 1 and resumed.fits["lags"].least < 1e-6
+    for one in (assimilation, resumed):
+        one.update([record])
+    assert other.weights == twin.weights == {"lags": 1.0} and resumed.misfits == assimilation.misfits
+    assert resumed.turns == assimilation.turns and resumed.turns["late"].waiting == 0
+    for name, one in twin.twins.items():
+        for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
+            assert torch.equal(mine, its)

@@ -1,5 +1,6 @@
 """What a policy observes: any choice of a plant's measurements, each scaled to order one; and previews of the wind."""
 
+import json
 import math
 
 import pytest
@@ -211,3 +212,35 @@ def test_deviation_and_correlation_are_those_asked_for(intervals):
     for lag in (1, 2, 5):
         correlation = (found[lag:] * found[:-lag]).mean() / found.square().mean()
         assert correlation.item() == pytest.approx(rho**lag, abs=0.04)
+
+
+def test_an_episode_that_ended_early_keeps_the_previews_that_were_read():
+    plant = WindTurbine(horizon=60.0, observe=("preview",))
+    plant.end_cost = 5.0
+    state, wind = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())[0]
+    actions = double(3e4, 2.0).expand(20, 2)
+    record = rt.Trajectory(state.expand(21, -1), actions, wind[:20])
+    virtual = VirtualEpisodes(rt.DigitalTwin(plant, plant.closure), rt.ExogenousConfig(), 1, generator=seeded())
+    again = virtual.repeated(record).exogenous[0]
+    assert torch.equal(again[:20], wind[:20])
+    assert torch.equal(again[20:40, 0], wind[:20, 0].flip(0)) and torch.equal(again[20:-8, 2], again[28:, 0])
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("name", "episodes", "words", "most"),
+    [
+        # Without noise the fit goes on until steps end in rounding.
+        ("flapping_wing", 1, ("--twinning.assimilation.iterations", "60"), 1e-3),
+        ("cryogenic_tank", 2, (), 1e-2),
+    ],
+)
+def test_the_weights_are_those_of_the_real_system_after_two_and_three_episodes(tmp_path, name, episodes, words, most):
+    """The classical controller flies the first of them; the twin has the true form, and sensors have no noise."""
+    fitted = ["--twinning.assimilation.inputs", "record", "--twinning.assimilation.method", "levenberg_marquardt"]
+    fitted += ["--twinning.arm", "model_based", "--twinning.hypotheses.which", "none", *words]
+    short = ["--episodes", str(episodes), "--unseen", "2", "--no-figures", "--threads", "1"]
+    recipe = load_recipe(RECIPES / f"{name}.py")
+    recipe.main(from_command_line(recipe.Config, [*short, *fitted, "--log-dir", str(tmp_path)]))
+    laws = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]
+    assert max(abs(laws["found"][weight] / true - 1.0) for weight, true in laws["true"].items()) < most

@@ -294,3 +294,22 @@ def test_a_failure_is_raised(failing):
 
     with pytest.raises(ArithmeticError, match=f"group {failing}"):
         for_each_group(21, 8, work)
+
+
+class NotBackwards(nn.Module):
+    """A closure whose recurrence becomes a program, and whose gradient does not."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(2, dtype=torch.float64))
+
+    def forward(self, features):
+        return nn.functional.hardshrink(features * self.weight, 0.1)
+
+
+def test_where_the_gradient_is_no_program_torch_computes_it():
+    case = case_of()
+    case.closure = NotBackwards()
+    with pytest.warns(UserWarning, match="hardshrink_backward"):
+        found = case.gradients("native")
+    assert_equal(found, case.gradients("autograd"))

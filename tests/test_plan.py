@@ -208,3 +208,17 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
     monkeypatch.setattr(found.virtual, "judge", judged)
     found.start()
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies
+
+
+def test_a_random_start_has_drawn_weights_where_layers_share_them():
+    class Twice(torch.nn.Module):
+        def __init__(self, gain):
+            super().__init__()
+            self.one = self.other = LinearGain(gain)
+
+        def forward(self, observation):
+            return 0.5 * (self.one(observation) + self.other(observation))
+
+    planning = multi_start(Twice([[3.0, 2.0]]), belief_of(), lambda generator: Twice([[1.0, 0.5]]))
+    planning.virtual.cost = lambda policy, episodes: policy.one.gain.sum().item()
+    assert {tuple(weight.flatten().tolist()) for weight in planning._random(1, EPISODES).values()} == {(1.0, 0.5)}

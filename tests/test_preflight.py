@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
+from faulty_system import as_reported
 from small_runs import SMALL
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
@@ -286,3 +288,61 @@ def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
     for note in ("neighbouring residuals of angle (0.9) are alike", ""):  # without one the residuals are noise
         metrics["summary"]["twin"]["note"] = note
         assert (f"  first flight: {doubt}" in results_table(metrics).splitlines()) == bool(note)
+
+
+class Stopped(Arm):
+    """The arm, whose second joint runs into a stiff stop that its twin does not know."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        beyond = state[..., 1] - state[..., 1].clamp(-0.3, 0.3)
+        stop = (2e4 * beyond + 20.0 * state[..., 3] * (beyond != 0.0)).unsqueeze(-1)
+        rate = super().vector_field(t, state, action, exogenous, closure)
+        return torch.cat([rate[..., :3], rate[..., 3:] - stop], -1)
+
+
+class Servo(rt.ClassicalController):
+    """Holds both joints at zero; through a wrong sign it drives them away."""
+
+    gain_units = {"proportional": "N m/rad", "derivative": "N m s/rad"}
+    default_gains = (8.0, 0.5)
+    memory_size = 0
+
+    def law(self, state, memory, exogenous):
+        proportional, derivative = self.gains.unbind()
+        return -proportional * state[..., :2] - derivative * state[..., 2:], memory
+
+
+def test_a_warning_of_a_far_start_names_a_unit_with_which_it_fits():
+    """Without torque the equations of the arm are linear, and hold in any unit."""
+    check = rt.check_real_system(wired(ARM, scale=TURN), ARM, spread=0.0)
+    assert not check.mistakes and len(check.doubts) == 4
+    assert all(re.search(r"draws [^:]*: in deg(/s)?, where the plant has rad", doubt) for doubt in check.doubts)
+
+
+@pytest.mark.parametrize(
+    ("signs", "words"),
+    [
+        ([1.0, 1.0], []),
+        ([1.0, -1.0], ["action torque_2 is negated"]),
+        ([-1.0, -1.0], ["all actions in N m are negated"]),
+    ],
+)
+def test_a_sign_is_named_although_feedback_through_it_drives_the_system_into_a_stop(signs, words):
+    check = rt.check_real_system(wired(ARM, real=Stopped(), sent=(signs, 0.0)), ARM, policy=Servo(ARM), spread=0.03)
+    assert list(check.mistakes) == words
+
+
+class Sparse(rt.PlantEnv):
+    """A plant of whose readings every fifth is lost."""
+
+    def _step(self, tensordict):
+        found = super()._step(tensordict)
+        if self._step_count % 5 == 0:
+            found["state"] = torch.full_like(found["state"], math.nan)
+        return found
+
+
+def test_intervals_that_begin_or_end_with_a_refused_reading_show_nothing():
+    guarded = rt.SafetyLayer(Sparse(PENDULUM, seed=1), rt.SafetyConfig(interval=PENDULUM.dt), fallback=(0.0,))
+    found = rt.check_real_system(as_reported(guarded, PENDULUM, exogenous=()), PENDULUM)
+    assert not found.mistakes and (found.present.share < 1e-12).all()

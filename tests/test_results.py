@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import time
 from unittest.mock import Mock
 
 import pytest
@@ -180,3 +181,12 @@ def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
     (tmp_path / "metrics.json").write_text(json.dumps({"episodes": episodes, "summary": summary}))
     with pytest.raises(ValueError, match=r"metrics\.json is damaged: it must hold episodes, a list, and summary"):
         read_metrics(tmp_path)
+
+
+def test_a_log_names_a_step_that_lasts(monkeypatch, capsys):
+    monkeypatch.setattr(dashboard, "QUIET", 0.2)
+    with Progress(1) as bar:
+        for step in ("interact", "learn", "plan"):
+            bar.doing(step)
+        time.sleep(0.6)
+    assert capsys.readouterr().err.splitlines() == ["real episode", "planning"]

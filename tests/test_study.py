@@ -4,6 +4,8 @@ import dataclasses
 import itertools
 import json
 import math
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from scipy.optimize import minimize
 from rt_torchrl import Comparison, compare_runs
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.compare import FinishedRun, Row, comparison_figure, paired_ratio
+from rt_torchrl.steps.interact import Interact
 
 TINY = Path(__file__).with_name("small_recipe.py")
 NAN = None  # in the place of what is not finite
@@ -252,3 +255,23 @@ def test_a_cluster_of_ray(tmp_path):
     finally:
         ray.shutdown()
     assert not failures and list(comparison.rows[0].costs) == [0, 1]
+
+
+def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatch):
+    forward, calls = Interact.forward, []
+
+    def pressed(step, episode):
+        calls.append(step)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return forward(step, episode)
+
+    made = config(tmp_path, given="--episodes 2", optimum=False)
+    with monkeypatch.context() as patched:
+        patched.setattr(Interact, "forward", pressed)
+        with pytest.raises(KeyboardInterrupt):
+            study.studied(made)
+    first, second = (tmp_path / "tiny" / "twinning" / f"seed-{seed}" for seed in (0, 1))
+    assert len(json.loads((first / "metrics.json").read_text())["episodes"]) == 1 and not second.exists()
+    (comparison,), failures = study.studied(made)
+    assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]

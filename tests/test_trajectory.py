@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from seeds_and_numbers import double, seeded
 from seeds_and_numbers import drawn as episodes_of
 from torch import nn
+from torchdiffeq import odeint
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, DivergenceError, Rollout, identification_cost, shipped_plants
 from rt_torchrl.contract.methods import random_commands
@@ -323,3 +324,43 @@ def test_a_weight_that_is_hardly_known_does_not_hold_up_the_others():
     LevenbergMarquardt(module).run(module.equations, 1)
     assert (module.w.sum() - 0.5).abs() < 0.05
     assert 0.1 < module.w.abs().max() <= 1.0
+
+
+def forced_pendulum(t, state):
+    angle, rate = state.unbind(-1)
+    return torch.stack([rate, -torch.sin(angle) - 0.2 * rate * rate.abs() + torch.cos(3.0 * t)], -1)
+
+
+def test_equals_torchdiffeq():
+    start = torch.randn(5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    times = 0.7 + 0.1 * torch.arange(21, dtype=torch.float64)
+    expected = odeint(forced_pendulum, start, times, method="rk4")
+    state = start
+    for t, reference in zip(times[:-1], expected[1:], strict=True):
+        state = rk4_step(forced_pendulum, t, state, 0.1)
+        # The same formula; only the rounding of t + h/3 and of the sums differs, over at most 20 steps.
+        torch.testing.assert_close(state, reference, rtol=1e-13, atol=1e-14)
+
+
+class Stiffness(nn.Module):
+    """p = (0, c s_1) with one number c, of no dimension."""
+
+    def __init__(self):
+        super().__init__()
+        self.c = nn.Parameter(torch.tensor(-0.2, dtype=torch.float64))
+
+    def forward(self, features):
+        return torch.stack([torch.zeros_like(features[..., 0]), self.c * features[..., 0]], -1)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_a_weight_may_be_a_number_without_a_dimension(native, monkeypatch):
+    plant = LinearQuadratic(horizon=1.0)
+    twin, flown, exogenous = recorded(plant)
+    given = flown.states[:, 0], exogenous, flown.actions
+    own = DigitalTwin(plant, Stiffness())
+    twin.closure.load_state_dict({"matrix": torch.tensor([[0.0, 0.0], [-0.2, 0.0]]).double()})
+    if not native:
+        monkeypatch.setattr(own.sensitivities._engine, "native_end_states", lambda *given: None)
+    _, whole = twin.sensitivities(*given)  # by the four numbers of the matrix, of which the third is c
+    torch.testing.assert_close(own.sensitivities(*given)[1], whole[..., 2:3])

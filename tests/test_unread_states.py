@@ -18,6 +18,8 @@ from test_real_system import Rig, connected
 
 import rt_torchrl as rt
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rosco import Answer
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.fit.log import SensorLog
 from rt_torchrl.fit.resampling import resample
@@ -264,3 +266,18 @@ def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = run_code("observations_and_costs.md")
     assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
+
+
+def test_roscos_simulator_remembers_past_observations():
+    plant = rt.StackedObservations(WindTurbine(horizon=4.0), 2)
+    start, wind, seen = plant.draw_initial_state(1, seeded())[0], 11.0 + 0.1 * torch.arange(8.0), []
+
+    def decide(state, speed, report):
+        seen.append(plant.observe(state.new_tensor(plant.dt * len(seen)), state, state.new_tensor([speed])))
+        return plant.actuate(state, state.new_tensor([3e4, 1.0]))
+
+    answer = Answer(plant, start, wind.numpy(), decide, 5)
+    for step in range(40):
+        answer.call_controller({"rot_speed": 1.0 + 0.002 * step, "ws": 11.0})
+    seen = torch.stack(seen)[None]
+    torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=0.0, atol=0.0)
