@@ -307,8 +307,8 @@ def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
 
 @needs_compiler
 def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, monkeypatch):
-    export = recipe("export")
-    monkeypatch.setattr(export.rt, "load_run", lambda folder, given: rt.load_run(folder, Config))
+    export, load_run = recipe("export"), rt.load_run
+    monkeypatch.setattr(export.rt, "load_run", lambda folder, given: load_run(folder, Config))
     export.main(export.Config(run=run.folder, what=("twin",), output=tmp_path, name="it"))
     assert "the twin with lags, which explains the records best" in capsys.readouterr().out
 
