@@ -147,7 +147,14 @@ class Real(Suspecting):
 
 
 MAGNETS = "magnets, −2 sin 2x"
-FORCES = {MAGNETS: lambda x, v: -2.0 * torch.sin(2.0 * x), "none": lambda x, v: 0.0 * x}
+FORCES = {
+    MAGNETS: lambda x, v: -2.0 * torch.sin(2.0 * x),
+    "strong magnets, −3 sin 2x": lambda x, v: -3.0 * torch.sin(2.0 * x),
+    "flutter, 0.8 v − 0.3 v³": lambda x, v: 0.8 * v - 0.3 * v**3,
+    "cubic damping, −0.3 v³": lambda x, v: -0.3 * v**3,
+    "dry friction, −0.8 tanh 5v": lambda x, v: -0.8 * torch.tanh(5.0 * v),
+    "none": lambda x, v: 0.0 * x,
+}
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
 NAMES = ("lags", "late, twice", "position sensor")
 
@@ -192,13 +199,16 @@ def test_it_explains_a_force_that_no_other_hypothesis_explains():
 
 
 @pytest.mark.slow
-def test_a_plan_on_what_it_explains_is_the_optimum():
-    real = Real(FORCES[MAGNETS], horizon=10.0)
+@pytest.mark.parametrize("force", FORCES)
+def test_a_plan_on_what_it_explains_is_the_optimum(force):
+    real = Real(FORCES[force], horizon=10.0)
     truth, episodes, unseen = DigitalTwin(real, real.closure), drawn(real, 40, seed=1), drawn(real, 200, seed=2)
     few, all_ = (learned(real, names)[0] for names in (NAMES, (*NAMES, FORCE)))
     twins = (truth, few.twins[ALONE], few, all_)
     optimum, alone, others, with_it = (truth.cost(planned(twin, episodes), *unseen).item() for twin in twins)
-    assert with_it / optimum < 1.005 and others / optimum > 1.02 and alone / optimum > 1.1
+    print(f"| {force} | {optimum:.4f} | {alone:.4f} | {others:.4f} | {with_it:.4f} |")
+    assert with_it < 1.02 * optimum
+    assert force != MAGNETS or (with_it / optimum < 1.005 and others / optimum > 1.02 and alone / optimum > 1.1)
 
 
 def test_a_fit_goes_on_as_without_a_resumption_where_the_last_weights_diverge():
