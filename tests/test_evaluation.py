@@ -17,7 +17,7 @@ from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.optimum import exact_optimum
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.signal import StateBounds
-from rt_torchrl.runs.results import results_table
+from rt_torchrl.runs.table import results_table
 from rt_torchrl.trajectories.engines.interval import Autograd
 from rt_torchrl.trajectories.rollout import ENGINES, DivergenceError
 

@@ -17,7 +17,8 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
-from rt_torchrl.runs.results import results_table, twin_entries
+from rt_torchrl.runs.results import twin_entries
+from rt_torchrl.runs.table import results_table
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (

@@ -19,7 +19,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine import unknown as wind_turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.runs.results import results_table
+from rt_torchrl.runs.table import results_table
 from rt_torchrl.systems.environment import AroundSystem
 
 

@@ -16,13 +16,14 @@ from test_export_recipe import RECIPES
 
 from rt_torchrl import PlannerConfig, ReinforcementTwinning, Run, TwinningConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.runs import dashboard, results
+from rt_torchrl.runs import dashboard, results, table
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Progress
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.metrics import read_metrics
-from rt_torchrl.runs.results import progress as progress_line
 from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.runs.table import next_steps
+from rt_torchrl.runs.table import progress as progress_line
 
 
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
@@ -137,7 +138,7 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": beside}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
-        return results.next_steps({"summary": found}, tmp_path, config)
+        return next_steps({"summary": found}, tmp_path, config)
 
     first = {"expected": 3.0, "paid": 2.0}
     assert "the live policy is not clearly better than PI: keep it" in said(live, 0.5 * cost, greatest=2.1)
@@ -164,7 +165,7 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
     rms, line = {"rotor_speed [rad/s]": 0.0123456, "shares [-]": None}, "RMS rotor_speed 0.0123 rad/s, shares diverges"
     for segment, where in ((0, "its last records"), (22, "segments of 22 intervals")):
         found = {"rms": rms, "segment": segment, "noise": {}, "standard_errors": {}}
-        assert results.fit_lines(found) == [f"  twin over {where}: {line}"]
+        assert table.fit_lines(found) == [f"  twin over {where}: {line}"]
     record = {"J_p": 1.0, "real_cost": 0.5, "live": "model_free"} | {f"rms/{name}": rms[name] for name in rms}
     assert progress_line(record) == f"{line}, real 0.5, live model-free"
 
@@ -172,7 +173,7 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
 def test_every_window_is_paid_and_episodes_are_counted_from_one():
     episodes = [{"episode": 1, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 2, "real_cost": 1.0}]
     assert results.cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
-    lines = results.alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
+    lines = table.alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
     assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from rt_torchrl.runs.results import progress
 from rt_torchrl.runs.settings import flat
+from rt_torchrl.runs.table import progress
 from rt_torchrl.systems.operation import FIRST
 
 GROUPS = {

@@ -26,11 +26,11 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import real_side, results
 from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress
-from rt_torchrl.runs.results import next_steps, results_table
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, checkpoints, load_checkpoint, save_checkpoint, save_tensors
 from rt_torchrl.runs.run_start import known_physics, start_of
 from rt_torchrl.runs.settings import numbers_of
+from rt_torchrl.runs.table import next_steps, results_table
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import make_twin
 from rt_torchrl.steps.learn import ActorCritic, Learner, LongTermMemory
