@@ -227,9 +227,12 @@ class ReinforcementTwinning(TensorDictSequential):
             episode["seconds", name] = time.perf_counter() - start
         return episode
 
-    def start(self, episode: TensorDictBase, *, tell: Callable[[str], None] = lambda part: None) -> TensorDictBase:
+    def start(
+        self, episode: TensorDictBase | None = None, *, tell: Callable[[str], None] = lambda part: None
+    ) -> TensorDictBase:
         """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
         assert self.first is not None
+        episode = TensorDict() if episode is None else episode
         pupils = self.first.take(self.policies, self.twin.closure)
         self.assimilation.begin()
         for half in (self.learner, self.planner):

@@ -8,7 +8,6 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from printed_commands import run_code
 from seeds_and_numbers import drawn, seeded
 from small_runs import SMALL
-from tensordict import TensorDict
 from test_anchored import replays_on
 from test_classical import PD
 from test_collectors import compare, system
@@ -334,7 +333,7 @@ def test_a_first_flight_that_ends_early_tells_what_policies_would_do(monkeypatch
         return match(self, pupil, pairs)
 
     monkeypatch.setattr(Imitation, "_match", matched)
-    found.start(TensorDict())
+    found.start()
     plant = found.twin.plant
     assert len(found.belief.first[0].trajectory.actions) < plant.n_steps
     assert found.virtual.draw(2).exogenous.shape[1] == plant.n_steps

@@ -4,7 +4,6 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import small_run
-from tensordict import TensorDict
 from test_algorithm import twinning
 from test_classical import PD
 
@@ -38,7 +37,7 @@ def begun(*, gains=GAINS, **options):
 def started(**options):
     """The algorithm after the flight of the controller, and the record of that."""
     found = begun(**options)
-    found.start(TensorDict())
+    found.start()
     (record,) = found.short_term
     return found, record
 
@@ -46,7 +45,7 @@ def started(**options):
 def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
     found = begun()
     closure = found.twin.closure.matrix.detach().clone()
-    report = found.start(TensorDict())
+    report = found.start()
     gain, (record,) = torch.tensor([GAINS], dtype=torch.float64), found.short_term
     for policy in found.policies.values():
         torch.testing.assert_close(policy.gain.detach(), gain, rtol=1e-3, atol=1e-3)
@@ -71,7 +70,7 @@ def test_each_half_alone_begins_with_it(arm):
 def test_a_harmful_controller_is_not_imitated():
     found = begun(gains=(30.0, 1e-6))
     before = found.policies["model_based"].gain.detach().clone()
-    assert "does not imitate the controller" in found.start(TensorDict())["reason"]
+    assert "does not imitate the controller" in found.start()["reason"]
     assert torch.equal(before, found.policies["model_based"].gain)
 
 

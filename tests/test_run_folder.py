@@ -198,7 +198,7 @@ def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, t
     found = load_tensors(folder / file.name)
     del found["state"]["algorithm"]["model_free.gain"]
     refused(found, r"(?s)weights of .* do not fit this training.*policies.*model_free\.gain")
-    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 7")
+    refused(found | {"format": 2}, "checkpoint-0002.pt has checkpoint format 2; this version reads format 8")
 
 
 def test_a_config_of_somebody_else_is_not_overwritten(tmp_path):

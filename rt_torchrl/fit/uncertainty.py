@@ -112,7 +112,7 @@ class Uncertainty:
     def errors_of(self, law: Callable[[], Float[Tensor, "*batch"]]) -> Float[Tensor, "*batch"]:
         """Standard errors of values that the closure's weights give, to first order, such as those of a law.
 
-        One of which the data say nothing is infinite, a fixed one zero.
+        One of which the data say nothing is infinite, a fixed one zero. They do not hold what a prior bends.
 
         Args:
             law: function that computes the values by the estimated closure, ``lambda: twin.closure(features)``.
