@@ -9,7 +9,14 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURES = {
     "wind_turbine": (
         *("flights.png", "states.png", "power_and_speed.png", "power_coefficient.png"),
-        *("exogenous.png", "policy_contours.png", "closure_weights.png", "learning_curves.png", "unseen.png"),
+        *(
+            "exogenous.png",
+            "policy_contours.png",
+            "closure_weights.png",
+            "learned_law.png",
+            "learning_curves.png",
+            "unseen.png",
+        ),
     ),
     "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png"),
     "cryogenic_tank": ("tank.png",),
