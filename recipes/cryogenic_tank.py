@@ -39,8 +39,6 @@ DEFAULT = rt.TwinningConfig(
         actor_rate=5e-4,
     ),
     exogenous=LOAD,
-    # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
-    assimilation=rt.AssimilationConfig(iterations=30),
     planner=rt.PlannerConfig(
         iterations=12,
         descent=dataclasses.replace(LBFGS, tolerance=1e-6),
@@ -53,7 +51,7 @@ DEFAULT = rt.TwinningConfig(
 NEURAL = dataclasses.replace(
     DEFAULT,
     # Segments last two hours. Without the prior the perceptron takes the first steps, which the constants should take.
-    assimilation=rt.AssimilationConfig(segment=240, prior=30.0),
+    assimilation=rt.AssimilationConfig(iterations=15, segment=240, prior=30.0),
     hypotheses=rt.HypothesesConfig(which=("none",)),
 )
 """Configuration of the training with ``--preset neural``."""

@@ -18,7 +18,7 @@ SWING_UP = rt.TwinningConfig(
     # Costs reach 16; the scale keeps values at the order of ten, which a perceptron can reach.
     learner=rt.LearnerConfig(critic_iterations=500, actor_iterations=1000, reward_scale=0.1, actor_rate=1e-3),
     # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
-    assimilation=rt.AssimilationConfig(iterations=30, segment=10),
+    assimilation=rt.AssimilationConfig(segment=10),
     # Tiny changes decide whether a swing reaches the top: a plan on few episodes says little about others.
     planner=rt.PlannerConfig(iterations=10, realisations=64, descent=rt.DescentConfig()),
 )

@@ -31,7 +31,7 @@ DEFAULT = rt.TwinningConfig(
     # Fits and plans converge over the episodes. The wind is the measured one, because draws of it leave an error in the
     # closure, and the plans 1 to 2 % above the optimum. While the first closures are wrong, a plan of a hundred
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
-    assimilation=rt.AssimilationConfig(method="lbfgs"),
+    assimilation=rt.AssimilationConfig(iterations=60, method="lbfgs"),
     planner=rt.PlannerConfig(
         iterations=25,
         realisations=50,

@@ -201,7 +201,7 @@ def test_a_mistake_is_named_although_the_closure_is_at_its_first_guess(name):
     assert words in found.mistakes[0] and len(found.mistakes) <= 2
     with pytest.raises(rt.WiringError, match="the real system does not fit its plant") as raised:
         found.require()
-    assert words in str(raised.value) and f"{plant.states[0].unit}, predicted to" in str(raised.value)
+    assert words in str(raised.value) and f"{plant.states[0].unit}, predicted within" in str(raised.value)
 
 
 def test_a_mistake_that_noise_hides_in_one_interval_shows_over_several():

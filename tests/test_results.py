@@ -186,8 +186,9 @@ def test_results_of_another_shape_are_refused(tmp_path, episodes, summary):
 
 def test_a_log_names_a_step_that_lasts(monkeypatch, capsys):
     monkeypatch.setattr(dashboard, "QUIET", 0.2)
+    monkeypatch.setattr(dashboard, "LONG", 0.7)
     with Progress(1) as bar:
         for step in ("interact", "learn", "plan"):
             bar.doing(step)
-        time.sleep(0.6)
-    assert capsys.readouterr().err.splitlines() == ["real episode", "planning"]
+        time.sleep(1.2)
+    assert capsys.readouterr().err.splitlines() == ["real episode", "planning", "planning, for 1 s"]

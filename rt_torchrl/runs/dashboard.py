@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from threading import Timer
+from threading import Timer, current_thread
 from typing import Any
 
 import numpy as np
@@ -90,8 +90,8 @@ WORDS = {
 """Words in which the bar shows each step of the algorithm."""
 
 
-QUIET = 10.0
-"""Time for which a log says nothing before it names the step under way [s]."""
+QUIET, LONG = 10.0, 60.0
+"""Times for which a log says nothing before it names the step under way, and names it again [s]."""
 
 
 class Progress:
@@ -106,35 +106,50 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True, disable=None)
         self._total, self._line_at = total, -QUIET
         self._costs, self._doing, self._alarm = "", "starting", False
-        self._later = Timer(QUIET, self._log)
+        self._later: Timer | None = None
 
     def __enter__(self) -> "Progress":
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._later.cancel()
+        self._cancel()
         self._doing = ""
         self._show()
         self._bar.close()
 
     def doing(self, what: str) -> None:
         """Show what begins now: the name of a step of the algorithm, or any other words."""
-        self._later.cancel()
-        self._doing = WORDS.get(what, what)
+        self._cancel()
+        self._doing, now = WORDS.get(what, what), time.monotonic()
         self._show()
-        if time.monotonic() - self._line_at > QUIET:
+        quiet = now - self._line_at > QUIET
+        if quiet:
             self._log(self._doing)
-            return
-        self._later = Timer(QUIET, self._log, (self._doing,))  # where it takes long
+        self._name_after(LONG if quiet else QUIET, self._doing, now)
+
+    def _name_after(self, seconds: float, step: str, since: float) -> None:
+        """Name the step in the log where it lasts that long, and again while it lasts."""
+        self._later = Timer(seconds, self._name, (step, since))
         self._later.daemon = True
         self._later.start()
+
+    def _name(self, step: str, since: float) -> None:
+        lasts = time.monotonic() - since
+        self._log(f"{step}, for {lasts:.0f} s" if lasts >= LONG else step)
+        if self._later is current_thread():  # nothing else has begun meanwhile
+            self._name_after(LONG, step, since)
+
+    def _cancel(self) -> None:
+        if self._later is not None:
+            self._later.cancel()
+        self._later = None
 
     def episode(self, record: dict[str, Any]) -> None:
         """Count an episode and show its costs.
 
         A line says when the twin's predictions begin or cease to be wrong, and why no policy may act.
         """
-        self._later.cancel()
+        self._cancel()
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:

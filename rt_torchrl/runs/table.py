@@ -19,7 +19,9 @@ MOST_CORRELATIONS = 3
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
-    "simulation of the real system": " in simulation, with the closure that the real system was given",
+    "simulation of the real system": (
+        " in simulation, with the closure that the real system was given, without noise of the sensors"
+    ),
     "twin": " on the twin, not on the real system",
 }
 """What the heading says of the place where the unseen episodes were flown; nothing where the system is simulated."""

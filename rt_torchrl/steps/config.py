@@ -158,7 +158,7 @@ class AssimilationConfig:
             :func:`rt_torchrl.fit.sensors.noise_levels`, of more than 1 % of the scatter of what they read.
     """
 
-    iterations: Count = 60
+    iterations: Count = 30
     stop_below: NotNegative = 0.0
     inputs: Literal["realisations", "record"] = "record"
     method: Literal["adam", "lbfgs", "levenberg_marquardt"] = "levenberg_marquardt"

@@ -142,7 +142,9 @@ class Wiring(NamedTuple):
         for signal, moved, share, error, noise in zip(self.plant.states, *columns, strict=True):
             explained = f"{100.0 * share:.3g} % unexplained" if share.isfinite() else "it does not move"
             explained += ", which is noise of its sensor" if noise else ""
-            rows.append(f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted to {error:.4g}; {explained}")
+            rows.append(
+                f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted within {error:.4g}; {explained}"
+            )
         rows += [f"  mistake: {mistake}" for mistake in self.mistakes] or ["  no mistake explains the readings better"]
         return "\n".join([*rows, *(f"  {doubt}" for doubt in self.doubts)])
 
