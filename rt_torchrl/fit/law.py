@@ -28,9 +28,10 @@ def asked_features(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Te
     hook = twin.believed_law.register_forward_pre_hook(keep)
     try:
         for record in map(believed.completed, records):
-            clock = record.start + believed.plant.dt * torch.arange(len(record.actions), dtype=torch.float64)
             states, closure = record.states[:-1], believed.closure
-            believed.plant.step(clock.to(states), states, record.actions, record.exogenous, closure)
+            intervals = torch.arange(len(states), dtype=states.dtype, device=states.device)
+            clock = record.start + believed.plant.dt * intervals
+            believed.plant.step(clock, states, record.actions, record.exogenous, closure)
     finally:
         hook.remove()
     return torch.cat([rows for rows in asked if rows.shape[-1] == asked[0].shape[-1]]) if asked else torch.empty(0, 0)

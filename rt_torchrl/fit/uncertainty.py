@@ -91,7 +91,7 @@ class Uncertainty:
     def _slopes(self, values: Sequence[Tensor]) -> Float[Tensor, "values n_w"]:
         """Derivatives of numbers by the trained weights of the closure."""
         weights = [w for w in self.likelihood.twin.closure.parameters() if w.requires_grad]
-        rows = [torch.zeros(0, sum(w.numel() for w in weights), dtype=torch.float64)]
+        rows = [self.covariance.new_zeros(0, sum(w.numel() for w in weights))]
         for value in values:
             slopes = tuple(torch.zeros_like(w) for w in weights)
             if value.requires_grad:  # one that is fixed does not
