@@ -12,7 +12,7 @@ from test_export_recipe import recipe
 from torch import nn
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Sensor, sensor_record, sensors_of
-from rt_torchrl.fit.law import asked_features
+from rt_torchrl.evaluation.law import asked_features
 
 ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)

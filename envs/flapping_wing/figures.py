@@ -4,13 +4,11 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from torch import Tensor
 
 from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
-from rt_torchrl.evaluation.checks import visited_features as features_of
+from rt_torchrl.evaluation.law import visited_features
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
@@ -94,7 +92,9 @@ def polars(snapshot: Snapshot) -> Figure:
     The lowest panel shows how often the last flight had each angle at 70 % of the span, because a twin can only know
     what was visited. Angles that no blade element had are pale.
     """
-    visited = visited_features(snapshot)
+    plant = cast(FlappingWing, snapshot.plant)
+    everywhere = visited_features(plant, plant.closure, plant.closure, snapshot.record)[0]  # (sin α_e, cos α_e)
+    visited = everywhere[:, (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()]
     C = {name: closure(visited) for name, closure in style.closures(snapshot).items()}
     rms = {name: array((C[name] - C["true"]).square().mean(0).sqrt()) for name in ("twin", "initial twin")}
     label, size = r"effective angle of attack $\alpha_e$ [deg]", (7.5, 8.4)
@@ -105,7 +105,7 @@ def polars(snapshot: Snapshot) -> Figure:
         for ax, values in zip(axes, array(closure(around)).T, strict=False):
             ax.plot(array(angle), values, **style.closure_look(name))
     edges = np.arange(-180.0, 180.0 + BIN, BIN)
-    anywhere = np.degrees(np.arctan2(*array(features_of(snapshot.plant, snapshot.record)).reshape(-1, 2).T))
+    anywhere = np.degrees(np.arctan2(*array(everywhere).reshape(-1, 2).T))
     filled = np.histogram(anywhere, edges)[0] > 0
     for k, name in enumerate(("lift coefficient $C_L$ [-]", "drag coefficient $C_D$ [-]")):
         note = f"RMS where visited {rms['twin'][k]:.2g}, initial {rms['initial twin'][k]:.2g}"
@@ -119,13 +119,6 @@ def polars(snapshot: Snapshot) -> Figure:
     axes[2].set_xlim(-180.0, 180.0)
     style.legend_below(figure, axes[:1])
     return figure
-
-
-def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
-    """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
-    plant = cast(FlappingWing, snapshot.plant)
-    element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
-    return features_of(plant, snapshot.record)[:, element]
 
 
 def control_surfaces(snapshot: Snapshot) -> Figure:

@@ -1,15 +1,14 @@
-"""Checks of a run: the gradient of its engine against that of plain autograd, and its closure where it has been."""
+"""The check of a run: the gradient of its engine against that of plain autograd."""
 
 import math
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import control_cost
 
 STEPS = 40
 TOLERANCE = 1e-8
@@ -70,22 +69,3 @@ def _gradient(
         return torch.zeros(sum(w.numel() for w in weights), dtype=cost.dtype, device=cost.device), cost.item()
     gradient = torch.autograd.grad(cost, weights, allow_unused=True, materialize_grads=True)
     return torch.cat([part.flatten() for part in gradient]), cost.item()
-
-
-@torch.no_grad()
-def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elements n_f"]:
-    """The features on which the vector field calls its closure, in every sample of a real episode.
-
-    Args:
-        plant: plant with the closure of the real system.
-        record: the real episode.
-    """
-    features = list[Tensor]()
-    hook = plant.closure.register_forward_pre_hook(lambda _, arguments: features.append(arguments[0]))
-    clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
-    t = record.start + plant.dt * clock
-    try:
-        plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, plant.closure)
-    finally:
-        hook.remove()
-    return features[-1]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.law import asked_features
+from rt_torchrl.evaluation.law import asked_features
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.config import Role

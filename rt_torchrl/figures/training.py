@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from rt_torchrl.evaluation.law import varying
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, ROLES, TWIN, array, caption, legend_below, role_name
-from rt_torchrl.fit.law import varying
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import Role
@@ -38,8 +38,8 @@ IDENTIFICATION: dict[str, dict[str, Any]] = {
 
 RESOLUTION = 81
 """Number of points along each observation."""
-SURE = 1.96
-"""Standard errors in half of a 95 % interval."""
+HALF_INTERVAL = 1.96
+"""Half of a 95 % interval, in standard errors."""
 MOST_OUTPUTS, MOST_FEATURES = 4, 3
 """Greatest numbers of outputs and of features of a law that are shown."""
 SHOWN = 400
@@ -169,7 +169,7 @@ def closure_weights(snapshot: Snapshot) -> Figure:
         ax.plot(np.arange(1, len(values) + 1), values, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if 0.0 < errors.get(name, 0.0) < math.inf:
             ends: dict[str, Any] = {"capsize": 3, "label": "95 % interval"}
-            ax.errorbar(len(values), values[-1], SURE * errors[name], color=TWIN, linewidth=1.0, **ends)
+            ax.errorbar(len(values), values[-1], HALF_INTERVAL * errors[name], color=TWIN, linewidth=1.0, **ends)
         if name in start:
             ax.axhline(start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
         if name in true:
@@ -214,7 +214,7 @@ def _draw_law(ax: Axes, snapshot: Snapshot, output: int, feature: int) -> None:
             ax.plot(array(axis), array(law(points)[:, output]), **style.closure_look(name))
     if snapshot.uncertainty is not None:
         values = snapshot.closure(points)[:, output]
-        reach = SURE * snapshot.uncertainty.errors_of(lambda: snapshot.closure(points)[:, output])
+        reach = HALF_INTERVAL * snapshot.uncertainty.errors_of(lambda: snapshot.closure(points)[:, output])
         reach[reach.isinf()] = math.nan
         below, above = array(values - reach), array(values + reach)
         ax.fill_between(array(axis), below, above, color=TWIN, alpha=0.2, linewidth=0, label="95 % interval")

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.evaluation.law import asked_features
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.fit.law import asked_features
 from rt_torchrl.options import read_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe

@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.evaluation.law import asked_features, varying
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
-from rt_torchrl.fit.law import asked_features, varying
 from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
