@@ -82,7 +82,10 @@ def exact_optimum(
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
     trained = [weight for weight in policies[0].parameters() if weight.requires_grad]
     all_searched = len(searched(policies[0])) == len(trained)
-    effort = (FOR_FEW_WEIGHTS if all_searched else FOR_PERCEPTRONS) | gradients
+    usual = FOR_FEW_WEIGHTS if all_searched else FOR_PERCEPTRONS
+    if unknown := gradients.keys() - usual.keys():
+        raise TypeError(f"{', '.join(sorted(unknown))} of the optimum must be some of {', '.join(usual)}.")
+    effort = usual | gradients
     costs = [descend(policy, few, effort["iterations"], approaching=effort["approach"]) for policy in policies]
     sound = [k for k in sorted(range(starts), key=costs.__getitem__) if math.isfinite(costs[k])]
     if not sound:

@@ -128,7 +128,6 @@ class RecedingHorizonPlanner:
         twin: twin on which the controller plans.
         policy: the controller, which acts in the place of π_mb.
         config: parameters of step 5.
-
     """
 
     policy: nn.Module
@@ -213,8 +212,11 @@ class MultiStart(Step):
         belief: what policies cost on the real system, and the virtual episodes.
         config: parameters of step 5.
         counts: numbers of virtual episodes that plans are made on, and judged on.
-        make_policy: function that draws a random policy; None for that of the plant. If it draws others than the
-            planner's policy, there are no random policies.
+        make_policy: function that draws a random policy of the same architecture; None for that of the plant, if its
+            policies have the same architecture, and else for no random policies.
+
+    Raises:
+        ValueError: if it draws policies of another architecture.
     """
 
     in_keys = ["number", "J_p", "large_scale"]
@@ -239,6 +241,11 @@ class MultiStart(Step):
         device = self.virtual.generator.device
         drawn = self.make_policy(torch.Generator(device=device)) if self.count else planner.policy
         self.alike = same_architecture(drawn, planner.policy)
+        if make_policy is not None and not self.alike:
+            raise ValueError(
+                f"make_policy draws a {type(drawn).__name__}, and model_based is another "
+                f"{type(planner.policy).__name__}; let it draw random policies like that one, or use starts=0."
+            )
 
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         """Take the step."""
