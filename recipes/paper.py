@@ -23,7 +23,8 @@ from torchrl.objectives import DDPGLoss
 from rt_torchrl.optimisers.descent import Descent
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import ExogenousProcess, sample_experience
-from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, LongTermMemory, ScaledPolicy
+from rt_torchrl.steps.learn import AT_ONCE, TRANSITION, Critic, ScaledPolicy
+from rt_torchrl.steps.memory import LongTermMemory
 from rt_torchrl.steps.report import weight_change
 from rt_torchrl.steps.switch import STALL
 from rt_torchrl.systems.collectors import collector_of

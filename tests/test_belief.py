@@ -206,14 +206,17 @@ class Hasty:
     restart = refuse = load_state_dict = state_dict = store = observations = nothing
 
 
-@pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])
-def test_an_update_that_flights_refute_is_taken_back(corrects, kept):
+@pytest.mark.parametrize(
+    ("corrects", "live", "refused"),
+    [(False, "model_free", False), (True, "model_based", False), (True, "model_free", True)],
+)
+def test_an_update_of_the_live_policy_that_flights_refute_is_taken_back(corrects, live, refused):
     belief, learner = belief_of(*REFUTED, corrects=corrects), Hasty(LinearGain([[3.0, 0.0]]))
-    learned = Learn(learner, belief, 1)(TensorDict({"transitions": {}}))
-    assert said(learner.policy) == kept and ("update_accepted" in learned) == corrects
+    learned = Learn(learner, belief, 1)(TensorDict({"transitions": {}}).set_non_tensor("live", live))
+    assert said(learner.policy) == (3.0 if refused else 2.0) and ("update_accepted" in learned) == refused
     expected = "update refused: model_free is expected to cost 14.8 with it, and 3.004 without"  # and 2 on the twin
-    assert not corrects or learned["reason"] == expected
-    assert learned["weight_changes", "model_free"] == pytest.approx(0.0 if corrects else 0.5)
+    assert not refused or learned["reason"] == expected
+    assert learned["weight_changes", "model_free"] == pytest.approx(0.0 if refused else 0.5)
 
 
 class Other(LinearGain):

@@ -14,8 +14,9 @@ from torchrl.objectives import DDPGLoss
 
 from rt_torchrl import LearnerConfig, Rollout, SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import equal
-from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
+from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.losses import BATCH, METHODS, LearningMethod, iteration, traced
+from rt_torchrl.steps.memory import LongTermMemory
 
 GAMMA = 0.9
 PLANT = LinearQuadratic()
@@ -338,7 +339,7 @@ ERRORS = torch.tensor([0.0, 0.1, 0.5, 1.0, 2.0, 5.0, 0.3, 0.3], dtype=torch.floa
 def test_sampling_follows_the_priorities(alpha, monkeypatch):
     """P(i) ∝ (|δ_i| + tol)^α*, by a χ² test at 0.1 %; the draws are seeded, so the outcome is always the same."""
     tol = 0.05
-    monkeypatch.setattr("rt_torchrl.steps.learn.TOL", tol)
+    monkeypatch.setattr("rt_torchrl.steps.memory.TOL", tol)
     found = memory(prioritisation=alpha)
     found.store(labelled(list(range(8))), -ERRORS)
     counts = torch.zeros(8)

@@ -15,7 +15,8 @@ from torchrl.collectors import Collector
 
 import rt_torchrl as rt
 from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig, RefereeConfig
-from rt_torchrl.steps.learn import ActorCritic, LongTermMemory
+from rt_torchrl.steps.learn import ActorCritic
+from rt_torchrl.steps.memory import LongTermMemory
 from rt_torchrl.steps.plan import MultiStart, make_planner
 from rt_torchrl.steps.switch import DecisionTree, clones
 

@@ -33,7 +33,8 @@ from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.runs.table import next_steps, results_table
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import make_twin
-from rt_torchrl.steps.learn import ActorCritic, Learner, LongTermMemory
+from rt_torchrl.steps.learn import ActorCritic, Learner
+from rt_torchrl.steps.memory import LongTermMemory
 from rt_torchrl.steps.plan import MakePlanner, make_planner
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, first_live
 from rt_torchrl.steps.switch import DecisionTree, MakeReferee
