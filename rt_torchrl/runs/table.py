@@ -110,7 +110,8 @@ def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
         cost, other = (_number(last[f"expected/{role}"], ".4g") for role in (live, other_than(live)))
         line += f", expected to cost {cost} on the real system, and {other_than(live).replace('_', '-')} {other}"
     judged = [record["update_accepted"] for record in episodes if "update_accepted" in record]
-    line += f"; its updates kept while model-free was live: {sum(judged):.0f} of {len(judged)}" if judged else ""
+    if judged:
+        line += f"; updates of model-free that were kept while it was live: {sum(judged):.0f} of {len(judged)}"
     clones = [record["episode"] for record in episodes if record["event"] == "clone"]
     return [line + (f"; the idle one became a clone after episode {clones[-1]}" if clones else "")]
 
