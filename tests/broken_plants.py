@@ -92,6 +92,10 @@ for message, overrides in (
     ("running_cost: cost has 1 values that are not finite", changed("running_cost", lambda cost: (-1.0 - cost).sqrt())),
     ("make_closure: has matrix in torch.float32", changed("make_closure", nn.Module.float)),
     ("make_closure: has no trainable weights", changed("make_closure", lambda closure: closure.requires_grad_(False))),
+    (
+        "closure_outputs: names 1 coefficients, make_closure gives 2",
+        {"closure_inputs": ("position [m]", "velocity [m/s]"), "closure_outputs": ("acceleration [m/s²]",)},
+    ),
     ("vector_field: closure weight 'forgotten' changes it at none", changed("make_closure", with_a_forgotten_weight)),
     (r"make_policy: draws 'force' .*outside \[-2, 2\]", changed("make_policy", stronger)),
     (f"make_policy: .* {AGAIN}.*a state of the plant", changed("make_policy", lambda _: Bounded(Recurrent()))),

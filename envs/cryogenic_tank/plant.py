@@ -188,6 +188,8 @@ class CryogenicTank(Plant):
     states = STATES
     actions: tuple[Signal, ...] = (COMMANDS["drop"],)
     inputs = (LOAD,)
+    closure_inputs = ("p over the set point [-]", "V_l over V_t [-]", "T_s - T [0.05 K]", "drop over the greatest [-]")
+    closure_outputs = tuple(f"{name} [{unit}]" for name, unit in ConstantCoefficients.names.items())
     measurements = (
         Measurement(symbol="e", name="pressure_error", unit="Pa", read=pressure_error, scale=error_unit),
         Measurement(symbol="T_s - T", name="superheat", unit="K", read=superheat, scale=superheat_unit),

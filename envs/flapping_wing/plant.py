@@ -174,6 +174,7 @@ class FlappingWing(Plant):
     states: tuple[Signal, ...] = POSITIONS + SPEEDS
     actions = ACTIONS
     inputs = (HEADWIND,)
+    closure_inputs, closure_outputs = ("sin α_e [-]", "cos α_e [-]"), ("lift coefficient [-]", "drag coefficient [-]")
     # ℓ = 2 m and v = 1 m/s: with these, good policies have weights of 1 to 2, which suit one learning rate.
     measurements: tuple[Measurement, ...] = (
         Measurement(symbol="e_x", name="error_x", unit="m", read=partial(error, 0), scale=2.0),

@@ -18,7 +18,6 @@ GREATEST_SHOWN = 0.1
 WIND_LABEL = r"wind speed $u$ [m/s]"
 SPEED_LABEL = r"generator speed $\omega_g$ [rad/s]"
 PITCH_LABEL = r"blade pitch $\beta$ [deg]"
-RATIO_LABEL = r"tip-speed ratio $\lambda$ [-]"
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -94,7 +93,7 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
     caption(error, "twin less true [-]")
     for ax in axes.flat:
         ax.plot(array(lam), array(beta), ".", color=TWIN, markersize=2.5, alpha=0.6, label="visited")
-        ax.set_xlabel(RATIO_LABEL)
+        ax.set_xlabel(r"tip-speed ratio $\lambda$ [-]")
     table.set_ylabel(PITCH_LABEL)
     table.set_xlim(lams[0].item(), lams[-1].item())
     table.set_ylim(betas[0].item(), betas[-1].item())

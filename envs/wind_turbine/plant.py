@@ -166,6 +166,7 @@ class WindTurbine(Plant):
     states: tuple[Signal, ...] = STATES
     actions = STATES[4:]
     inputs = (WIND,)
+    closure_inputs, closure_outputs = ("tip speed ratio [-]", "blade pitch [deg]"), ("power coefficient [-]",)
     measurements = (
         Measurement(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0, read=speed_error),
         Measurement.of(ERROR_INTEGRAL, Named(ERROR_INTEGRAL.name)),

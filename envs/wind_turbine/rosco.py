@@ -128,9 +128,8 @@ class Answer:
         self.state = after
 
     def _slope(self, state: Tensor, wind: float) -> Tensor:
-        exogenous = state.new_tensor([wind])
-        rate = self.plant.vector_field(state.new_zeros(()), state, state[4:6], exogenous, self.plant.closure)
-        return rate[self._filters]
+        t, exogenous = state.new_zeros(()), state.new_tensor([wind])
+        return self.plant.vector_field(t, state, state[4:6], exogenous, self.plant.closure)[self._filters]
 
     def kill_discon(self) -> None:
         """Do nothing, because there is no library to unload."""

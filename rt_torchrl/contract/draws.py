@@ -126,6 +126,11 @@ def modules(plant: Plant) -> Iterator[str]:
             if value.dtype != torch.float64:
                 yield f"{name}: has {weight} in {value.dtype}; expected torch.float64: call .double()."
         yield from _other_sources(name, partial(_drawn_weights, make))
+        inputs, outputs = plant.innermost.closure_inputs, plant.innermost.closure_outputs
+        if inputs and name.endswith("closure"):
+            found = module(torch.zeros(1, len(inputs), dtype=torch.float64)).shape[-1]
+            if found != len(outputs):
+                yield f"closure_outputs: names {len(outputs)} coefficients, {name} gives {found}; name each of them."
         if name != "closure" and not any(weight.requires_grad for weight in module.parameters()):
             yield f"{name}: has no trainable weights; what is learned must be an nn.Parameter with requires_grad."
     # Observations are of order one, as they should be scaled.

@@ -46,6 +46,11 @@ def asked_features(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Te
     return torch.cat([rows for rows in visited if rows.shape[-1] == visited[0].shape[-1]] or [torch.empty(0, 0)])
 
 
+def name_of(names: Sequence[str], k: int, kind: str) -> str:
+    """Name and unit of the k-th input or output of a closure, or its number, as in ``feature 2``."""
+    return names[k] if names else f"{kind} {k + 1}"
+
+
 def varying(values: Float[Tensor, "rows n"]) -> list[int]:
     """Places of the outputs that are no constants over rows of features."""
     if not len(values):

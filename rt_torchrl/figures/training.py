@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from rt_torchrl.evaluation.law import varying
+from rt_torchrl.evaluation.law import name_of, varying
 from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, ROLES, TWIN, array, caption, legend_below, role_name
@@ -219,8 +219,9 @@ def _draw_law(ax: Axes, snapshot: Snapshot, output: int, feature: int) -> None:
         below, above = array(values - reach), array(values + reach)
         ax.fill_between(array(axis), below, above, color=TWIN, alpha=0.2, linewidth=0, label="95 % interval")
     _draw_visited(ax, visited[:, feature])
-    caption(ax, f"output {output + 1} of the closure")
-    ax.set_xlabel(f"feature {feature + 1}")
+    plant = snapshot.plant.innermost
+    caption(ax, name_of(plant.closure_outputs, output, "output"))
+    ax.set_xlabel(name_of(plant.closure_inputs, feature, "feature"))
 
 
 @torch.no_grad()

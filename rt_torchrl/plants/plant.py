@@ -94,6 +94,10 @@ class Plant(nn.Module):
     """
     memories: tuple[str, ...] = ()
     """Names of those of them that :meth:`memorise` alone writes: they hold what was measured, without further noise."""
+    closure_inputs: tuple[str, ...] = ()
+    """Names and units of the features of the closure, as in ``"blade pitch [deg]"``; results number them without."""
+    closure_outputs: tuple[str, ...] = ()
+    """The same of the coefficients that the closure gives."""
     state_sizes: tuple[float, ...] = ()
     """Usual sizes of the states, in their units; by default ones."""
     end_cost: float | None = None

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation.law import asked_features, varying
+from rt_torchrl.evaluation.law import asked_features, name_of, varying
 from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
 from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.fit.uncertainty import Uncertainty
@@ -180,7 +180,7 @@ def fit_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
 
 
 def law_of(twin: DigitalTwin, records: Sequence[Trajectory], uncertainty: Uncertainty) -> dict[str, Any]:
-    """The range of each of the ``features`` in the records, and of each output that depends on them, by its number.
+    """The range of each of the ``features`` in the records, and of each output that depends on them, by name and unit.
 
     An output has its ``range`` and the ``median`` and the ``greatest`` of its standard errors there. It is empty if no
     output depends on the features.
@@ -192,11 +192,12 @@ def law_of(twin: DigitalTwin, records: Sequence[Trajectory], uncertainty: Uncert
         return {}
     visited = features[:: max(1, len(features) // LAW_ROWS)]
     errors = uncertainty.errors_of(lambda: twin.believed_law(visited)[:, places])
-    outputs = {
-        str(k + 1): {"range": _ends(values[:, k]), "median": error.median().item(), "greatest": error.max().item()}
-        for k, error in zip(places, errors.T, strict=True)
-    }
-    return {"features": [_ends(course) for course in features.T], "outputs": outputs}
+    plant, outputs = twin.believed.plant.innermost, dict[str, Any]()
+    for k, error in zip(places, errors.T, strict=True):
+        spread = {"median": error.median().item(), "greatest": error.max().item()}
+        outputs[name_of(plant.closure_outputs, k, "output")] = {"range": _ends(values[:, k])} | spread
+    inputs = [name_of(plant.closure_inputs, k, "feature") for k in range(features.shape[-1])]
+    return {"features": dict(zip(inputs, map(_ends, features.T), strict=True)), "outputs": outputs}
 
 
 def _ends(values: Tensor) -> list[float]:

@@ -194,16 +194,14 @@ def law_lines(law: dict[str, Any]) -> list[str]:
     """Lines with the law of the closure where its last records went; elsewhere it says nothing."""
     if not law:
         return []
-    ranges = [f"feature {k} from {low:.3g} to {high:.3g}" for k, (low, high) in enumerate(law["features"], 1)]
+    ranges = [f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in law["features"].items()]
     lines = [f"  law of the closure where its last records went, {', '.join(ranges)}:"]
     for name, output in list(law["outputs"].items())[:MOST_WEIGHTS]:
         (low, high), median, greatest = (
             output["range"],
             *(_number(output[key], ".2g") for key in ("median", "greatest")),
         )
-        lines.append(
-            f"    output {name} from {low:.4g} to {high:.4g}, standard error {median} (median), at most {greatest}"
-        )
+        lines.append(f"    {name} from {low:.4g} to {high:.4g}, standard error {median} (median), at most {greatest}")
     return lines
 
 
