@@ -63,8 +63,9 @@ def by_hand(plant, policy, state, inputs):
         total += plant.running_cost(t, state, action, z).item()
         state = plant.step(t, state, action, z, plant.closure).state
         if abs(state[0]) > plant.reach:
-            return k + 1, (total + (len(inputs) - k - 1) * plant.end_cost) / len(inputs)
-    return len(inputs), (total + 0.5 * state[0].item() ** 2 / plant.dt) / len(inputs)
+            break
+    final = 0.5 * state[0].item() ** 2 / plant.dt
+    return k + 1, (total + final + (len(inputs) - k - 1) * plant.end_cost) / len(inputs)
 
 
 @pytest.mark.parametrize("engine", ["native", "parallel", "autograd"])
@@ -165,7 +166,8 @@ def test_a_training_learns_from_episodes_of_unequal_length():
     record = found.belief.flown[0].trajectory
     t = plant.dt * torch.arange(n).double()
     running = plant.running_cost(t, record.states[:-1], record.actions, record.exogenous).sum()
-    expected = (running + (plant.n_steps - n) * plant.end_cost) / plant.n_steps
+    final = plant.terminal_cost(record.states[-1]) / plant.dt
+    expected = (running + final + (plant.n_steps - n) * plant.end_cost) / plant.n_steps
     assert first["real_cost"].item() == pytest.approx(expected.item(), rel=1e-9)
     # Records of unequal length, without noise of sensors, say all of four weights.
     torch.testing.assert_close(found.twin.closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-4)

@@ -4,9 +4,10 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import drawn
+from small_runs import small_run
 from test_classical import PD
 
-from rt_torchrl import DigitalTwin, ExogenousConfig
+from rt_torchrl import DigitalTwin, ExogenousConfig, PlantEnv, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
@@ -77,6 +78,24 @@ class Integrating(LinearQuadratic):
 
 
 @torch.no_grad()
+def test_costs_of_a_simulated_system_are_those_of_its_readings():
+    plant = LinearQuadratic(horizon=3.0)
+    flown = PlantEnv(plant, seed=2, noise=0.2).rollout(plant.n_steps)[0, :-1]
+    t = plant.dt * torch.arange(len(flown), dtype=torch.float64)
+    read = plant.running_cost(t, flown["state"], flown["next", "applied"], flown["exogenous"])
+    torch.testing.assert_close(-flown["next", "reward"].flatten(), read, rtol=1e-12, atol=0.0)
+
+
+def test_what_a_run_found_of_the_noise_is_loaded_and_said(tmp_path, capsys):
+    run = small_run(tmp_path, episodes=1, noise=0.05)
+    run.algorithm.twin.noise = LEVELS
+    metrics = run.train()
+    noise = load_run(tmp_path, plant=LinearQuadratic(horizon=2.0)).twin.noise
+    assert noise.any() and torch.equal(noise, run.algorithm.twin.noise)
+    assert metrics["summary"]["unseen"]["judged_on"] == "simulation without noise of the sensors"
+    assert "unseen ones in simulation without noise of the sensors" in capsys.readouterr().out
+
+
 def test_an_integral_of_what_is_read_tells_nothing_of_the_noise():
     plant, records = Integrating(horizon=40.0), []
     for seed in range(4):

@@ -11,7 +11,15 @@ from small_runs import SMALL, small_run
 from test_algorithm import flown as after
 from test_algorithm import twinning
 
-from rt_torchrl import ClassicalController, OperatingLimits, PlantEnv, RunConfig, SafetyLayer, Trajectory
+from rt_torchrl import (
+    ClassicalController,
+    ExplorationConfig,
+    OperatingLimits,
+    PlantEnv,
+    RunConfig,
+    SafetyLayer,
+    Trajectory,
+)
 from rt_torchrl.runs.real_side import simulated
 from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.switch import other_than
@@ -99,6 +107,20 @@ def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
     run(tmp_path / "cut", episodes=2).train()
     resumed = run(tmp_path / "cut", episodes=3, resume=True).train()["episodes"]
     assert [{**record, "seconds": 0} for record in resumed] == [{**record, "seconds": 0} for record in whole]
+
+
+@pytest.mark.parametrize("limits", [{}, {"actions": {"force": (-0.3, 0.3)}}, {"rates": {"force": 2.0}}])
+def test_a_perfect_twin_flies_again_what_the_layer_sent(limits, tmp_path):
+    fixed = dataclasses.replace(SMALL.assimilation, iterations=0)
+    exploration = ExplorationConfig(spread=0.5, episodes=9)
+    options = {"limits": OperatingLimitsConfig(**limits), "assimilation": fixed, "exploration": exploration}
+    run = small_run(tmp_path, episodes=2, twinning=dataclasses.replace(SMALL, **options))
+    run.algorithm.twin.closure.load_state_dict(LinearQuadratic().closure.state_dict())
+    for record in run.train()["episodes"]:
+        # Rounding of sums over twenty intervals.
+        assert record["paired_difference"] == pytest.approx(0.0, abs=1e-9) and record["alarm"] == 0.0
+    actions = run.algorithm.short_term[-1].actions
+    assert (actions.abs().max() > 0.3 + 1e-9) == ("actions" not in limits)
 
 
 class Lagged(ClassicalController):

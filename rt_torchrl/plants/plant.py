@@ -254,14 +254,18 @@ class Plant(nn.Module):
         raise NotImplementedError
 
     def terminal_cost(self, state: State) -> Cost:
-        """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
+        """Cost Φ_a of the state at the end of an episode, also an early one, in the unit of L_a times seconds.
+
+        By default it is zero.
+        """
         return state.new_zeros(state.shape[:-1])
 
     def ended(self, state: State) -> Ended:
         """Whether an episode has ended in this state; by default never.
 
-        A plant that overrides this method sets :attr:`end_cost`, greater than what L_a is in a bad episode, or else an
-        early end would pay.
+        A plant that overrides this method sets :attr:`end_cost`. Where an end is a failure, it is greater than what L_a
+        is in a bad episode, or else the end would pay; where an end is the goal, such as a landing, it may be zero, and
+        :meth:`terminal_cost` says how good the end is.
         """
         return torch.zeros_like(state[..., 0], dtype=torch.bool)
 
@@ -419,24 +423,20 @@ def cost_rate(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, exogenous
     return torch.where(plant.ended(state), torch.full_like(running, plant.end_cost), running)
 
 
-def final_cost(plant: Plant, state: State) -> Cost:
-    """Φ_a of the last state of an episode, or zero if the episode had ended in it."""
-    terminal = plant.terminal_cost(state)
-    return terminal if plant.end_cost is None else torch.where(plant.ended(state), torch.zeros_like(terminal), terminal)
-
-
 def flight_costs(
     plant: Plant, t: Tensor, states: Float[Tensor, "*batch m n_s"], applied: Tensor, exogenous: Tensor
-) -> tuple[Float[Tensor, "*batch n"], Ended]:
-    """L_a in each interval of a flight, or L_e from its early end on, and whether it has ended by its last state.
+) -> tuple[Float[Tensor, "*batch n"], State]:
+    """L_a in each interval of a flight, or L_e from its early end on, and the state in which it has ended.
 
     A flight under recorded actions may leave the state again in which it ended, unlike one of :func:`held`.
     """
     running = plant.running_cost(t, states[..., :-1, :], applied, exogenous)
     if plant.end_cost is None:
-        return running, torch.zeros_like(states[..., 0, 0], dtype=torch.bool)
+        return running, states[..., -1, :]
     over = plant.ended(states).cumsum(-1) > 0
-    return torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running), over[..., -1]
+    last = (~over).sum(-1).clamp(max=states.shape[-2] - 1)  # place of the first state that has ended, if one has
+    end = torch.take_along_dim(states, last[..., None, None], -2).squeeze(-2)
+    return torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running), end
 
 
 @runtime_checkable

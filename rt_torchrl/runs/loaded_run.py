@@ -256,9 +256,11 @@ def load_run(
             part.load_state_dict(weights[role])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
+    twin = _twin(folder, config, physics, closure, weights.get("hypotheses"))
+    twin.noise = weights.get("noise", twin.noise)
     return LoadedRun(
         config=config,
-        twin=_twin(folder, config, physics, closure, weights.get("hypotheses")),
+        twin=twin,
         plant=plant,
         physics=physics,
         closure=closure,

@@ -355,7 +355,8 @@ class Run:
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
         # Metrics of an earlier end must not lie beside these weights, because they say that the run is finished.
         (self.folder / "metrics.json").unlink(missing_ok=True)
-        save_tensors(self.folder / "weights.pt", weights | self.algorithm.twin.state_dict())
+        twin = self.algorithm.twin
+        save_tensors(self.folder / "weights.pt", weights | {"noise": twin.noise} | twin.state_dict())
         write_json(self.folder / "metrics.json", metrics)
         return metrics
 

@@ -23,8 +23,9 @@ WHERE = {
         " in simulation, with the closure that the real system was given, without noise of the sensors"
     ),
     "twin": " on the twin, not on the real system",
+    "simulation": "",
 }
-"""What the heading says of the place where the unseen episodes were flown; nothing where the system is simulated."""
+"""What the heading says of the place where the unseen episodes were flown; others are named as they are."""
 
 
 def progress(record: dict[str, Any]) -> str:
@@ -54,7 +55,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     """The table of results that the terminal shows at the end of a run."""
     summary, episodes = metrics["summary"], metrics["episodes"]
     unseen, fitted, paid = summary["unseen"], summary["twin"], summary["cost_of_learning"]
-    where, twin = WHERE.get(unseen["judged_on"], ""), " on the twin" if on_the_twin(unseen) else ""
+    place, twin = unseen["judged_on"], " on the twin" if on_the_twin(unseen) else ""
+    where = WHERE.get(place, f" in {place}")
     if twin and fitted["noise"]:
         where = where.replace(twin, f"{twin} with noise of the sensors")
     width = 22 + len(twin)

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from rt_torchrl.plants.plant import Plant, final_cost
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.config import Arm, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.steps.interact import Flight
@@ -146,8 +146,8 @@ class RecordedFlights(Start):
 def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     """The transitions of a record, as a learner stores those of a real episode.
 
-    The last one is truncated, unless the episode ends there early, and pays the terminal cost if the record is as long
-    as an episode.
+    The last one is truncated, unless the episode ends there early, and pays the terminal cost if it ends there or the
+    record is as long as an episode.
     """
     states, actions, inputs, start, _ = record
     n = len(actions)
@@ -155,11 +155,11 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     # There is no input after the last interval; the last input takes its place.
     observation = plant.observe(t, states, torch.cat([inputs, inputs[-1:]]))
     reward = -plant.running_cost(t[:-1], states[:-1], actions, inputs)
-    if n == plant.n_steps:
-        reward = torch.cat([reward[:-1], reward[-1:] - final_cost(plant, states[-1:]) / plant.dt])
     done = torch.zeros(n, 1, dtype=torch.bool, device=states.device)
     done[-1] = True
     over = done & plant.ended(states[1:]).unsqueeze(-1)
+    if n == plant.n_steps or over.any():
+        reward = torch.cat([reward[:-1], reward[-1:] - plant.terminal_cost(states[-1:]) / plant.dt])
     ends = {"reward": reward.unsqueeze(-1), "done": done, "truncated": done & ~over, "terminated": over}
     entries = {"observation": observation[:-1], "action": actions, "next": {"observation": observation[1:], **ends}}
     return TensorDict(entries, batch_size=[n], device=states.device)

@@ -284,10 +284,10 @@ def flown(
     states, factors, command = states[: n + 1], factors[: n + 1], command[:n]
     drive, over = Drive(*(values[:n] for values in drive)), ends[n - 1]
     applied = plant.actuate(states[:-1], command)
-    reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
-    reward[-1] -= ~over * plant.terminal_cost(states[-1]) / plant.dt
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
     measured = states * factors
+    reward = -plant.running_cost(drive.t, measured[:-1], applied, drive.exogenous)
+    reward[-1] -= plant.terminal_cost(states[-1]) / plant.dt
     entries = {"state": measured[..., : len(plant.readings)], "exogenous": exogenous}
     entries["observation"] = plant.observe(t, measured, exogenous)
     entries["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])

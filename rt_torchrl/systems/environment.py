@@ -31,7 +31,7 @@ class PlantEnv(EnvBase):
     ``state``, ``exogenous``               n_r, z  readings of s_k, and z_k, which a record holds beside actions
     ``action``                             n_a     the command, within the ranges of the plant's actions
     ``("next", "applied")``                n_a     the action that the actuators applied
-    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k); at the horizon also −Φ_a(s_n)/Δt
+    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k); at the end also −Φ_a/Δt
     ``("next", "truncated")``              1       true at the horizon
     ``("next", "terminated")``             1       true where the plant's episode has ended early (:meth:`Plant.ended`)
     =====================================  ======  ===================================================================
@@ -41,9 +41,9 @@ class PlantEnv(EnvBase):
         seed: seed of the generator that draws initial states and exogenous inputs.
         device: device on which the environment runs.
         noise: standard deviation of the sensors' error as a share of the value that they read. Every reported state is
-            s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
-            the true state. What a controller memorises (:attr:`Plant.memories`) is what was measured then, and gets no
-            further noise.
+            s(1 + noise·w), where w is standard normal. The observation and L_a are computed from it, as in front of a
+            machine; Φ_a and an early end are those of the true state. What a controller memorises
+            (:attr:`Plant.memories`) is what was measured then, and gets no further noise.
 
     Raises:
         ValueError: if ``noise`` is out of its range.
@@ -117,7 +117,7 @@ class PlantEnv(EnvBase):
         t, exogenous = self._now()
         command = tensordict["action"]
         transition = self.plant.step(t, self._state, command, exogenous, self.closure)
-        cost = self.plant.running_cost(t, self._state, transition.applied, exogenous)
+        cost = self.plant.running_cost(t, self._state * self._factor, transition.applied, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
             raise DivergenceError(
                 f"plant {self.plant.name!r} diverged at t = {t.item():g} s: state {self._state.tolist()}, "
@@ -166,12 +166,16 @@ def at_end(plant: Plant, cost: Cost, end: State, *, last: bool) -> dict[str, Ten
         plant: the plant.
         cost: running cost of the interval.
         end: state at its end.
-        last: whether the horizon is reached, where the reward has the cost at the end.
+        last: whether the horizon is reached.
+
+    Returns:
+        ``reward``, which has the cost at the end where the episode is over, and the flags.
     """
     terminated = plant.ended(end).unsqueeze(-1)
     truncated = ~terminated & last
-    reward = -(cost + truncated.squeeze(-1) * plant.terminal_cost(end) / plant.dt).unsqueeze(-1)
-    return {"reward": reward, "done": truncated | terminated, "terminated": terminated, "truncated": truncated}
+    done = truncated | terminated
+    reward = -(cost + done.squeeze(-1) * plant.terminal_cost(end) / plant.dt).unsqueeze(-1)
+    return {"reward": reward, "done": done, "terminated": terminated, "truncated": truncated}
 
 
 def declare_specs(env: EnvBase, plant: Plant, *, refused: bool = False) -> None:

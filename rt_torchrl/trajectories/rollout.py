@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.plants.plant import Plant, final_cost
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.trajectories.engines.code import require_pure_once
 from rt_torchrl.trajectories.engines.interval import (
@@ -133,7 +133,7 @@ class Rollout:
         if costs is not None and all_finite(costs):
             charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
             if charged:  # the sum holds the change from the first state's
-                costs = costs + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
+                costs = costs + self.plant.terminal_cost(initial_state) / (exogenous.shape[1] * self.plant.dt)
             return costs
         return control_cost(self.plant, self._flown(initial_state, exogenous, drive, start))
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rt_torchrl.plants.plant import Plant, final_cost, flight_costs
+from rt_torchrl.plants.plant import Plant, flight_costs
 
 
 class Scenario(NamedTuple):
@@ -128,15 +128,14 @@ def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: flo
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:
     r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples.
 
-    Where it ends early, it costs L_e from there on; see :mod:`rt_torchrl.plants.plant`.
+    Where it ends early, it costs L_e from there on, and Φ_a is that of the state in which it ended.
     """
     states, actions, exogenous, start, _ = trajectory
     n = actions.shape[-2]
     clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock
-    costs, ended = flight_costs(plant, t, states, actions, exogenous)
-    last = plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
-    return costs.mean(-1) + torch.where(ended, torch.zeros_like(last), last)
+    costs, end = flight_costs(plant, t, states, actions, exogenous)
+    return costs.mean(-1) + plant.terminal_cost(end) / (n * plant.dt)
 
 
 def until_end(plant: Plant, flown: Trajectory) -> Trajectory:
@@ -149,10 +148,7 @@ def whole_cost(plant: Plant, flight: Trajectory, n: int) -> Float[Tensor, " batc
     """J_a of whole episodes of n intervals; with fewer they have ended, even if readings with noise do not show it."""
     flown = flight.actions.shape[-2]
     cost = control_cost(plant, flight)
-    if flown < n:
-        last = final_cost(plant, flight.states[..., -1, :]) / (flown * plant.dt)
-        cost = (flown * (cost - last) + (n - flown) * (plant.end_cost or 0.0)) / n
-    return cost
+    return cost if flown == n else (flown * cost + (n - flown) * (plant.end_cost or 0.0)) / n
 
 
 def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"]:

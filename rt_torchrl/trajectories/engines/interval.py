@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
-from rt_torchrl.plants.plant import Plant, cost_rate, final_cost, held
+from rt_torchrl.plants.plant import Plant, cost_rate, held
 
 
 class Drive(NamedTuple):
@@ -76,7 +76,7 @@ class CostInterval(nn.Module):
         plant, s = self.interval.plant, state[..., :-1]
         applied = plant.actuate(s, self.interval.command(s, drive))
         end = self.interval(s, drive)
-        change = (final_cost(plant, end) - final_cost(plant, s)) / plant.dt
+        change = (plant.terminal_cost(end) - plant.terminal_cost(s)) / plant.dt
         cost = state[..., -1] + cost_rate(plant, drive.t, s, applied, drive.exogenous) + change
         return torch.cat([end, cost.unsqueeze(-1)], -1)
 
