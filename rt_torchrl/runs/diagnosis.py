@@ -139,14 +139,13 @@ def _class(run: LoadedRun, unseen: UnseenEpisodes, validation: UnseenEpisodes, b
     name, remedy = "the class of policies is too small", "further observations, --policy mlp with more hidden units"
     if run.physics.end_cost is not None:
         return Reason(name, None, "model predictive control does not consider that an episode may end early", remedy)
-    remedy = f"{remedy}, or model predictive control (--preset mpc)"
     window = run.config.twinning.planner.receding_horizon
     controller = PredictiveControl(unseen.plant, unseen.known_closure(), window)
     controller.learn(validation.exogenous)
     costs = unseen.control_costs(controller)
     evidence = f"model predictive control costs {costs.mean():.4g} on the twin, the best of the class {best.mean():.4g}"
     holds = None if _dearer(costs, best, CLASS) else _dearer(best, costs, CLASS)
-    return Reason(name, holds, evidence, remedy)
+    return Reason(name, holds, evidence, f"{remedy}, or model predictive control (--preset mpc)" if holds else remedy)
 
 
 def _inputs(run: LoadedRun, costs: Costs) -> Reason:

@@ -284,7 +284,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     elif rival is not None:
         steps.append(
             f"the live policy is not clearly better than {rival}: keep it, let the policy observe what it computes, "
-            "train with more --twinning.planner.iterations, or judge both in more episodes (--unseen, --real-unseen)"
+            "train with more --twinning.planner.iterations, or judge both in more episodes (--unseen, --real-unseen); "
+            f"rt_torchrl.diagnose({call}) says why"
         )
     elif summary["better"] != live:
         steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
