@@ -18,7 +18,7 @@ from rt_torchrl.steps.report import Step, in_words, merged, metrics
 from rt_torchrl.systems.config import OperatingLimitsConfig
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation import FIRST, Operation
-from rt_torchrl.systems.safety import OperatingLimits, report_of, require_layer
+from rt_torchrl.systems.safety import OperatingLimits, SafetyReport, report_of, require_layer
 from rt_torchrl.systems.sound_part import (
     FLIGHTS,
     EpisodeEndedError,
@@ -61,7 +61,8 @@ class Flight(NamedTuple):
         refused: why earlier attempts could not be learned from.
         whole: whether the record is that of a whole episode, to its horizon or to its early end.
         after: number of control intervals after an early end, and what each of them costs, L_e.
-        commands: the commands of the record's intervals, before safety layers and actuators.
+        commands: the commands of the record's intervals before the actuators; where a safety layer sent another one,
+            what was applied.
     """
 
     transitions: TensorDict
@@ -121,6 +122,9 @@ class RealFlights:
                 raise ValueError(tried_in_vain(refused)) from failure
         rows = episode[first:last]
         commands, states = rows["action"].clone(), torch.cat([rows["state"], rows["next", "state"][-1:]])
+        events = [] if self._report is None else self._report.events
+        changed = [k - first for k in (e.step for e in events if e.asked != e.applied) if first <= k < last]
+        commands[changed] = rows["next", "applied"][changed]
         parts = [_transitions(episode, part) for part in sound.parts]
         transitions = parts[sound.parts.index((first, last))]
         record = Trajectory(states, rows["next", "applied"], rows["exogenous"], first * self.plant.dt)
@@ -130,6 +134,11 @@ class RealFlights:
             check(record)
         return Flight(transitions, record, parts, refused, sound.whole, after, commands)
 
+    @property
+    def _report(self) -> SafetyReport | None:
+        """The report of the safety layer about the last episode; None without a layer."""
+        return self.env.report if isinstance(self.env, Operation) else report_of(self.env)
+
     def _attempt(self) -> tuple[TensorDictBase | None, SoundPart, Exception | None]:
         """One episode, its sound part, and the error that ended it."""
         try:
@@ -138,8 +147,7 @@ class RealFlights:
             flown, failure = error.flown, error
         sound, episode = SoundPart([], [], "", whole=False), None if flown is None else flown[0]
         if episode is not None:
-            report = self.env.report if isinstance(self.env, Operation) else report_of(self.env)
-            sound = sound_part(episode, self.plant, report)
+            sound = sound_part(episode, self.plant, self._report)
         if failure is not None:
             n = 0 if episode is None else len(episode)
             faults = [*sound.faults, Fault("ended", n, n * self.plant.dt, str(failure))]
