@@ -77,7 +77,6 @@ class Integrating(LinearQuadratic):
         return torch.stack([action[..., 0] - 0.3 * state[..., 0], state[..., 0]], -1)
 
 
-@torch.no_grad()
 def test_costs_of_a_simulated_system_are_those_of_its_readings():
     plant = LinearQuadratic(horizon=3.0)
     flown = PlantEnv(plant, seed=2, noise=0.2).rollout(plant.n_steps)[0, :-1]
@@ -96,6 +95,7 @@ def test_what_a_run_found_of_the_noise_is_loaded_and_said(tmp_path, capsys):
     assert "unseen ones in simulation without noise of the sensors" in capsys.readouterr().out
 
 
+@torch.no_grad()
 def test_an_integral_of_what_is_read_tells_nothing_of_the_noise():
     plant, records = Integrating(horizon=40.0), []
     for seed in range(4):

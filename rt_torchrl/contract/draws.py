@@ -117,6 +117,7 @@ def modules(plant: Plant) -> Iterator[str]:
     makers = {"closure": lambda generator: plant.closure}
     makers |= {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
     makers |= {} if neural is None else {"make_neural_closure": neural}
+    inputs, outputs = plant.innermost.closure_inputs, plant.innermost.closure_outputs
     for name, make in makers.items():
         module = make(seeded())
         if not isinstance(module, nn.Module):
@@ -126,7 +127,6 @@ def modules(plant: Plant) -> Iterator[str]:
             if value.dtype != torch.float64:
                 yield f"{name}: has {weight} in {value.dtype}; expected torch.float64: call .double()."
         yield from _other_sources(name, partial(_drawn_weights, make))
-        inputs, outputs = plant.innermost.closure_inputs, plant.innermost.closure_outputs
         if inputs and name.endswith("closure"):
             found = module(torch.zeros(1, len(inputs), dtype=torch.float64)).shape[-1]
             if found != len(outputs):

@@ -48,7 +48,7 @@ def asked_features(twin: DigitalTwin, records: Sequence[Trajectory]) -> Float[Te
 
 def name_of(names: Sequence[str], k: int, kind: str) -> str:
     """Name and unit of the k-th input or output of a closure, or its number, as in ``feature 2``."""
-    return names[k] if names else f"{kind} {k + 1}"
+    return names[k] if k < len(names) else f"{kind} {k + 1}"
 
 
 def varying(values: Float[Tensor, "rows n"]) -> list[int]:

@@ -11,9 +11,9 @@ The real system and its digital twin have the *same* map: they differ in the clo
 An episode may end early, such as by overspeed or ground contact. A system that has ended stays in the state in which it
 ended, and each moment after the end t_e costs L_e:
 
-.. math:: J_a = \frac1{T_o}\Big(\int_0^{t_e} L_a\,dt + (T_o - t_e) L_e\Big)
+.. math:: J_a = \frac1{T_o}\Big(\int_0^{t_e} L_a\,dt + \Phi_a(s(t_e)) + (T_o - t_e) L_e\Big)
 
-There is no terminal cost Φ_a then. With an absorbing state the cost of an episode is one number, however long the
+With an absorbing state the cost of an episode is one number, however long the
 episode lasts, and the value of what comes after the end is known: a learner with the discount γ per interval counts
 :math:`-L_e/(1 - \gamma)`.
 """

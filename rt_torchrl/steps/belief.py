@@ -14,11 +14,11 @@ twin, its replay with what the twin did not explain may chance not to. The corre
 .. math:: m = s^2\sum_ic_i/s_i^2, \qquad s^{-2} = \sum_is_i^{-2}
 
 and the cost that is expected on the real system is :math:`\hat Je^{m + s^2/2}`, with Ĵ of virtual episodes. Plans over
-whole episodes descend this one; updates, clones and the referee of step 6 compare it. Of weights that flew, their own n
-flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that what a real
-episode refuted does not come back because policies like it were cheap. How well the episodes predict each other chooses
-σ and v. A twin that says of all these episodes, with what they explored, what they cost, within 5 % and what noise of
-the sensors (:func:`~rt_torchrl.fit.sensors.noise_levels`) explains, is believed as it is.
+whole episodes descend this one; updates of a live π_mf, clones and the referee of step 6 compare it. Of weights that
+flew, their own n flights alone count: m is the mean of their paired differences and :math:`s^2 = \sigma^2/n`, so that
+what a real episode refuted does not come back because policies like it were cheap. How well the episodes predict each
+other chooses σ and v. A twin that says of all these episodes, with what they explored, what they cost, within 5 % and
+what noise of the sensors (:func:`~rt_torchrl.fit.sensors.noise_levels`) explains, is believed as it is.
 """
 
 import contextlib

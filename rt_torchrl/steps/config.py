@@ -112,9 +112,9 @@ class RefereeConfig:
 
     Args:
         rule: rule of the referee: ``decision_tree``, as in the paper, or ``expected_cost``, which lets the policy act
-            that is expected to cost less on the real system. With this rule plans, updates and clones are judged by
-            what they are expected to cost there, too (:class:`~rt_torchrl.steps.belief.Belief`); with the paper's,
-            plans and distilled clones are judged by the twin alone, and updates by nothing.
+            that is expected to cost less on the real system. With this rule plans, updates of a live π_mf and clones
+            are judged by what they are expected to cost there, too (:class:`~rt_torchrl.steps.belief.Belief`); with the
+            paper's, plans and distilled clones are judged by the twin alone, and updates by nothing.
         patience: number P_π of episodes in a row that a reason to swap must outlast, in the decision tree.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.

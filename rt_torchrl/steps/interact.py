@@ -123,7 +123,7 @@ class RealFlights:
         rows = episode[first:last]
         commands, states = rows["action"].clone(), torch.cat([rows["state"], rows["next", "state"][-1:]])
         events = [] if self._report is None else self._report.events
-        changed = [k - first for k in (e.step for e in events if e.asked != e.applied) if first <= k < last]
+        changed = [e.step - first for e in events if first <= e.step < last and e.asked != e.applied]
         commands[changed] = rows["next", "applied"][changed]
         parts = [_transitions(episode, part) for part in sound.parts]
         transitions = parts[sound.parts.index((first, last))]
