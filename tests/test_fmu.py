@@ -145,6 +145,46 @@ def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
     made.close()
 
 
+class Recorded:
+    """An FMU whose steps return a status, and what is called after the first step."""
+
+    def __init__(self, fmu, status):
+        self.fmu, self.status, self.calls = fmu, status, None
+
+    def __getattr__(self, name):
+        if self.calls is not None:
+            self.calls.append(name)
+        return getattr(self.fmu, name)
+
+    def doStep(self, **at):
+        self.calls = []
+        if self.status:
+            raise fmpy.fmi1.FMICallException("fmi2DoStep", self.status)
+        self.fmu.doStep(**at)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("status", "allowed"), [(0, ["getReal", "terminate", "freeInstance"]), (3, ["freeInstance"]), (4, [])]
+)
+def test_after_an_error_only_what_the_standard_allows_is_called(turbine, status, allowed):
+    """FMI 2.0.4, 4.2.4: an FMU with an error is freed without its termination, and a fatal one is left alone."""
+    made = environment(turbine)
+    entries = made.reset()
+    recorded = made._fmu = Recorded(made._fmu, status)
+    entries.set("action", torch.zeros(2, dtype=torch.float64))
+    if status:
+        with pytest.raises(FMUError, match=r"the FMU turbine.fmu refuses a call at t = 0 s"):
+            made.step(entries)
+    else:
+        made.step(entries)
+    first = made._folder
+    assert made.reset()["outputs"].isfinite().all() and recorded.calls == allowed
+    assert (made._folder == first) == (status != 4) and Path(made._folder).exists()
+    made.close()
+    assert not Path(made._folder).exists()
+
+
 @needs_compiler
 def test_an_fmu_takes_the_inputs_that_act_and_what_does_not_fit_is_refused(turbine, tmp_path):
     seen = WindTurbine(horizon=20.0, observe=("preview",))

@@ -153,6 +153,9 @@ class CallingSimulator(ForeignSystem):
         super().close(**kwargs)
 
 
+FMI_OK, FMI_ERROR, FMI_FATAL = 0, 3, 4  # the statuses of FMI 2.0 that decide what may be called next
+
+
 class FMUError(RuntimeError):
     """The FMU has refused a call; the message names the FMU, the call and the time."""
 
@@ -212,6 +215,7 @@ class FMUEnvironment(ForeignSystem):
         self._actions, self._outputs, self._exogenous = tuple(actions), tuple(outputs), tuple(exogenous)
         self._start, self._steps = start, 0
         self._fmu: Any = None  # FMPy says no types
+        self._status = FMI_OK
         self._folder = self._fmpy.extract(str(self.path))
 
     def _require(self, names: Mapping[str, Sequence[str]]) -> None:
@@ -269,13 +273,23 @@ class FMUEnvironment(ForeignSystem):
         try:
             yield
         except Exception as error:  # FMPy raises plain exceptions
+            self._status = getattr(error, "status", FMI_ERROR)
             t = self._steps * self.plant.dt
             raise FMUError(f"the FMU {self.path.name} refuses a call at t = {t:g} s: {error}") from error
 
     def _free(self) -> None:
-        """Free the FMU, which need not be able to end its simulation: after an error it may refuse."""
-        fmu, self._fmu = self._fmu, None
-        for call in () if fmu is None else (fmu.terminate, fmu.freeInstance):
+        """Free the FMU as far as FMI 2.0 allows: after an error it may not end its simulation.
+
+        After a fatal error nothing of this library may be called any more; the next episode loads another copy.
+        """
+        fmu, status, self._fmu, self._status = self._fmu, self._status, None, FMI_OK
+        if fmu is None:
+            return
+        if status == FMI_FATAL:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = self._fmpy.extract(str(self.path))
+            return
+        for call in (fmu.freeInstance,) if status == FMI_ERROR else (fmu.terminate, fmu.freeInstance):
             with contextlib.suppress(Exception):  # nobody uses this instance any more
                 call()
 
