@@ -5,11 +5,14 @@ At the minimum of J (:mod:`likelihood`) the Gauss-Newton matrix H is the Fisher 
 .. math:: \mathrm{Cov} = H^{-1}\ \text{(fisher)}, \qquad \mathrm{Cov} = H^{-1}MH^{-1}\ \text{(robust)}
 
 where M, the Newey-West sum of the scores :math:`g_k` of each record, allows residuals that depend on their neighbours,
-and noise that differs between samples:
+and noise that differs between samples. Noise that drives the system makes residuals that last as long as the system
+remembers; what scores inherit from the sample before, by the correlation ρ of all records, is therefore taken off
+first (:math:`u_k = g_k - \rho g_{k-1}`, :math:`u_1 = \sqrt{1 - \rho^2}\,g_1`), and given back to the sum of n samples:
 
 .. math::
-    M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \qquad
-    \Gamma_l = \sum_kg_kg_{k+l}^\top
+    M = \frac{1 + 2\sum_{l=1}^{n-1}(1 - l/n)\rho^l}{1 - \rho^2}
+    \Big[\Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top)\Big], \qquad
+    \Gamma_l = \sum_ku_ku_{k+l}^\top
 
 Residuals are orthogonal to their derivatives, so that M of a short record is too small: it is multiplied by n/(n − p),
 for n samples and p unknowns, and no combination of the unknowns is told better than by white noise of their size.
@@ -18,7 +21,8 @@ Named values of the closure take their errors from those of the weights to first
 change Δ by a Newton step counts as well, :math:`\sqrt{\sigma^2 + \Delta^2}`. Both formulas assume that the physics is
 right: an error that no weights can remove is bias, and no record shows its size.
 
-Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
+Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631; for ρ, Andrews and Monahan,
+Econometrica 60 (1992) 953.
 """
 
 import math
@@ -39,6 +43,8 @@ BAD_SHARE = 0.5
 """Standard error of a value, as a share of the value, above which the data do not tell it from zero."""
 HIGH_CORRELATION = 0.99
 """Correlation of two values above which the data tell only one combination of them."""
+GREATEST_CORRELATION = 0.97
+"""Of neighbouring scores; the formula diverges at 1."""
 LEAST_EIGENVALUE = 1e-12
 """Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
 
@@ -66,12 +72,17 @@ class Uncertainty:
         self.covariance = self._inverse.matrix
         ahead = -(self.covariance @ equations.gradient)[: likelihood.weight_count]  # the Newton step
         if errors == "robust":
-            M, samples = torch.zeros_like(equations.matrix), 0
+            M, segments = torch.zeros_like(equations.matrix), []
             for block in blocks:
                 all_scores = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
                 for scores, seen, places in zip(all_scores, block.group.seen.any(-1), block.group.places, strict=True):
-                    M[places[:, None], places] += newey_west(scores[seen])
-                    samples += int(seen.sum())
+                    segments.append((scores[seen], places))
+            samples, diagonal = sum(len(scores) for scores, _ in segments), equations.matrix.diagonal()
+            correlation = neighbours(
+                [scores / diagonal[places].clamp_min(1e-300).sqrt() for scores, places in segments]
+            )
+            for scores, places in segments:
+                M[places[:, None], places] += newey_west(scores, correlation)
             root = self._inverse.root
             ratios, vectors = torch.linalg.eigh(root.T @ M @ root * (samples / max(samples - root.shape[1], 1)))
             root, squares = root @ vectors, sum(float(block.values.square().sum()) for block in blocks)
@@ -219,14 +230,24 @@ def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
     return InverseInformation(root, torch.cat([directions[:, ~significant], identity[:, ~informed]], -1), ~informed)
 
 
-def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
-    """The matrix M of one segment of n samples, with L = ⌈4 (n/100)^{2/9}⌉."""
-    lags = min(math.ceil(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0)), len(scores) - 1)
-    M = scores.T @ scores
+def neighbours(segments: Sequence[Float[Tensor, "samples n"]]) -> float:
+    """The correlation ρ of neighbouring scores in all segments together, at most GREATEST_CORRELATION."""
+    product = sum(float((scores[1:] * scores[:-1]).sum()) for scores in segments)
+    square = sum(float(scores.square().sum()) * (1.0 - 1.0 / len(scores)) for scores in segments if len(scores))
+    return max(-GREATEST_CORRELATION, min(GREATEST_CORRELATION, product / square)) if square else 0.0
+
+
+def newey_west(scores: Float[Tensor, "samples n"], correlation: float) -> Float[Tensor, "n n"]:
+    """The matrix M of one segment of n samples with the correlation ρ, with L = ⌈4 (n/100)^{2/9}⌉."""
+    count = len(scores)
+    lags = min(math.ceil(4.0 * (count / 100.0) ** (2.0 / 9.0)), count - 1)
+    innovations = torch.cat([math.sqrt(1.0 - correlation**2) * scores[:1], scores[1:] - correlation * scores[:-1]])
+    M = innovations.T @ innovations
     for lag in range(1, lags + 1):
-        product = scores[:-lag].T @ scores[lag:]
+        product = innovations[:-lag].T @ innovations[lag:]
         M = M + (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    return M
+    inherited = 1.0 + 2.0 * sum((1.0 - lag / count) * correlation**lag for lag in range(1, count))
+    return M * (inherited / (1.0 - correlation**2))
 
 
 def named_values(closure: nn.Module) -> dict[str, Tensor]:
