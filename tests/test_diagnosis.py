@@ -13,6 +13,8 @@ from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 import rt_torchrl as rt
 from rt_torchrl.options import configuration
 
+pytestmark = pytest.mark.training
+
 CLASSICAL, TWIN, MINIMUM, CLASS, INPUTS, COST, CHATTER = range(7)
 
 

@@ -231,11 +231,11 @@ def test_standard_errors_are_those_of_the_regression_that_step_4_is():
     (error,) = fit.uncertainty([record]).standard_errors().values()
     assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
     assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
-    # A slope that the fit has not reached is off by as much more.
+    # A slope that the fit has not reached is off by as much more, and its residuals, which last, widen the error, too.
     with torch.no_grad():
         (logarithm,) = closure.parameters()
         off = closure.coefficients.item()
         logarithm.add_(0.01)
         off = closure.coefficients.item() - off
     (wider,) = fit.uncertainty([record]).standard_errors().values()
-    assert wider == pytest.approx(off, rel=0.02)
+    assert off < wider < 1.05 * off

@@ -25,6 +25,8 @@ from test_run_folder import Bomb, same
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import load_tensors, plain, save_tensors
 
+pytestmark = pytest.mark.training
+
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""
 

@@ -12,6 +12,8 @@ from rt_torchrl.runs.results import first_there
 from rt_torchrl.steps.switch import Imitation
 from rt_torchrl.trajectories.trajectory import control_cost
 
+pytestmark = pytest.mark.training
+
 GAINS = (0.4, 0.3)
 
 

@@ -15,6 +15,8 @@ from rt_torchrl import ReinforcementTwinning, Run
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 
+pytestmark = pytest.mark.training
+
 ROOT = Path(__file__).parents[1]
 HERE = (str(ROOT / "rt_torchrl"), str(ROOT / "envs"))
 RARE = {str(ROOT / "rt_torchrl" / name) for name in ("programs/tracer.py", "trajectories/anchored.py")}

@@ -9,6 +9,8 @@ from rt_torchrl.runs.metrics import read_metrics
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.settings import module_of
 
+pytestmark = pytest.mark.training
+
 RECIPES = Path(__file__).parents[1] / "recipes"
 SHORT = {"wind_turbine": 20.0, "flapping_wing": 0.05, "cryogenic_tank": 3000.0}
 PLANTS = ["wind_turbine", *(pytest.param(name, marks=pytest.mark.slow) for name in SHORT if name != "wind_turbine")]

@@ -11,6 +11,8 @@ from test_export_recipe import recipe
 from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
 from rt_torchrl.steps.switch import clones
 
+pytestmark = pytest.mark.training
+
 PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0))
 FIT = AssimilationConfig(iterations=10, inputs="record", method="lbfgs")
 

@@ -22,6 +22,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.table import results_table
 from rt_torchrl.systems.environment import AroundSystem
 
+pytestmark = pytest.mark.training
+
 
 class Outlets(rt.PositiveCoefficients):
     """Outlets of the four tanks and gains of the two pumps."""

@@ -16,6 +16,8 @@ from rt_torchrl.steps.learn import ActorCritic, Learner
 from rt_torchrl.steps.losses import METHODS
 from rt_torchrl.steps.switch import DecisionTree, Referee
 
+pytestmark = pytest.mark.training
+
 PLANT = LinearQuadratic(horizon=2.0)
 SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}
 

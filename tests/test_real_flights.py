@@ -21,6 +21,8 @@ from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 from rt_torchrl.runs.real_side import entries
 
+pytestmark = pytest.mark.training
+
 STEPS = 20
 
 

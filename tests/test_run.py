@@ -20,6 +20,8 @@ from rt_torchrl.steps.memory import LongTermMemory
 from rt_torchrl.steps.plan import MultiStart, make_planner
 from rt_torchrl.steps.switch import DecisionTree, clones
 
+pytestmark = pytest.mark.training
+
 
 def test_a_run_leaves_its_results_readable(tmp_path):
     run = small_run(tmp_path, episodes=4, figures=True, unseen_every=2)

@@ -21,6 +21,8 @@ from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, Planne
 from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.steps.switch import clones
 
+pytestmark = pytest.mark.training
+
 record_log = recipe("record_log")
 recorded = record_log.recorded
 

@@ -18,6 +18,8 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.compare import FinishedRun, Row, comparison_figure, paired_ratio
 from rt_torchrl.steps.interact import Interact
 
+pytestmark = pytest.mark.training
+
 TINY = Path(__file__).with_name("small_recipe.py")
 NAN = None  # in the place of what is not finite
 
