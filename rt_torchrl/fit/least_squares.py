@@ -463,7 +463,7 @@ def not_white(likelihood: Likelihood) -> str:
     pairs = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), strict=True)
     alike = ", ".join(f"{sensor.name} ({value:.2g})" for sensor, value in pairs if value > ALIKE)
     words = (
-        f"neighbouring residuals of {alike} are alike: the twin lacks something, steps or reads too coarsely, or noise "
-        "drives the system (then fit single intervals: segment=1); standard errors do not hold what that changes"
+        f"neighbouring residuals of {alike} are alike: noise drives the system, which robust standard errors hold, or "
+        "the twin lacks something, steps or reads too coarsely, which no standard errors hold"
     )
     return words if alike else ""
