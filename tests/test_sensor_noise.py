@@ -5,11 +5,12 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import drawn
 from small_runs import small_run
+from tensordict.nn import TensorDictModule
 from test_classical import PD
 
 from rt_torchrl import DigitalTwin, ExogenousConfig, PlantEnv, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.evaluation.unseen import TwinEpisodes
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, TwinEpisodes
 from rt_torchrl.fit.sensors import noise_levels
 from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.steps.belief import Belief
@@ -86,13 +87,21 @@ def test_costs_of_a_simulated_system_are_those_of_its_readings():
 
 
 def test_what_a_run_found_of_the_noise_is_loaded_and_said(tmp_path, capsys):
-    run = small_run(tmp_path, episodes=1, noise=0.05)
+    run = small_run(tmp_path, episodes=1, noise=0.05, real_unseen=2)
     run.algorithm.twin.noise = LEVELS
     metrics = run.train()
     noise = load_run(tmp_path, plant=LinearQuadratic(horizon=2.0)).twin.noise
     assert noise.any() and torch.equal(noise, run.algorithm.twin.noise)
     assert metrics["summary"]["unseen"]["judged_on"] == "simulation without noise of the sensors"
     assert "unseen ones in simulation without noise of the sensors" in capsys.readouterr().out
+    # Flights of the real system itself have it.
+    env, policy = PlantEnv(run.algorithm.twin.plant, noise=0.05), run.algorithm.policies[metrics["summary"]["live"]]
+    env.set_seed(UNSEEN_SEED)
+    env.pass_over()  # as before every flight
+    actor = TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
+    reward = env.rollout(env.plant.n_steps, actor)["next", "reward"]
+    costs = metrics["summary"]["real_unseen"]["costs"][metrics["summary"]["live"]]
+    assert len(costs) == 2 and costs[0] == pytest.approx(-reward.mean().item())
 
 
 @torch.no_grad()

@@ -61,7 +61,7 @@ def judged_on(
         unseen = UnseenEpisodes(plant, config.unseen, device=device)
         beside = {"noise of the sensors": config.noise, "the safety layer": config.twinning.limits}
         if left_out := " and ".join(what for what, there in beside.items() if there):
-            unseen.judged_on = f"simulation without {left_out}"
+            unseen.judged_on = f"simulation without {left_out}"  # with which real_unseen flies
     elif env.closure is not None:
         unseen = UnseenEpisodes(plant, config.unseen, device=device)
         unseen.closure, unseen.judged_on = env.closure, "simulation of the real system"

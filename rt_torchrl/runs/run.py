@@ -126,6 +126,7 @@ class Run:
             simulated = functools.partial(real_side.simulated, plant, config, first, device=self.device)
             make_env, system = None if isinstance(env, RealSystem) else env or simulated, self._real or simulated()
             make_learner = learner or functools.partial(ActorCritic, replay=replay)
+            self._system = system
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector)
             self.unseen = real_side.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
             self.baselines = {name: law.to(self.device) for name, law in controllers.items()}
@@ -298,7 +299,7 @@ class Run:
         """
         count, live = self.config.real_unseen, self.algorithm.referee.live
         interrupted = len(self.episodes) < self.config.episodes and self.ended is None
-        if self._real is None or not count:
+        if not count:
             return None
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
         if reason := real_side.grounded(self.config, self.algorithm, self.initial_policies):
@@ -312,7 +313,7 @@ class Run:
         names = ", ".join(f"{count} of {name}" for name in laws)
         bar.write(f"{count * len(laws)} flights on the real system, which count as paid: {names}")
         bar.doing("judging on the real system")
-        episodes = RealEpisodes(self._real, count, device=self.device)
+        episodes = RealEpisodes(self._system, count, device=self.device)
         episodes.bounds = self.unseen.bounds
         flights = dict[str, Trajectory]()
         for name, law in laws.items():

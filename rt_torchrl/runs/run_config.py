@@ -76,10 +76,10 @@ class RunConfig:
             unseen episodes and as many flights of a controller on a real system after the training.
         unseen: number of unseen episodes that twin and policies are judged on at the end, in simulation. Those of a
             real system whose closure is not known are flown on the twin alone.
-        real_unseen: number of episodes that each controller flies at the end on a real system that is not simulated
-            here: the live policy, if it was trained, and the controller of start. The run says how many flights of whom
-            before the first one, and counts them as paid; after Ctrl-C nothing flies. Baselines that nothing but the
-            real system can fly do so as many times, and are refused with 0.
+        real_unseen: number of episodes that each controller flies at the end on the real system as it is, with noise
+            of the sensors and limits: the live policy, if it was trained, and the controller of start. The run says how
+            many flights of whom before the first one, and counts them as paid; after Ctrl-C nothing flies. Baselines
+            that nothing but the real system can fly do so as many times, and are refused with 0.
         preflight: whether the first flight of a real system is compared with one-step predictions of the twin before
             anything is learned, and wiring that does not fit is refused; see :func:`check_real_system`.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the

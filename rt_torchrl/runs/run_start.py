@@ -160,11 +160,6 @@ def _require_simulation(config: RunConfig, env: RealSystem | None, baselines: di
     real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
     if env is not None and config.noise:
         raise ValueError(f"noise={config.noise} needs a plant in simulation; this run has a real system.")
-    if env is None and config.real_unseen:
-        raise ValueError(
-            f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
-            "its own; leave it out, and unseen says how many episodes are simulated."
-        )
     if real and not (unknown and config.real_unseen):
         raise ValueError(
             f"baselines {real} can only be flown on the real system: give a RealSystem without its closure, and "
