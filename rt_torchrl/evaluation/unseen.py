@@ -271,13 +271,13 @@ class RealEpisodes(UnseenEpisodes):
             ValueError: if in several episodes in a row the system fails, or has such readings.
         """
         from rt_torchrl.steps.interact import RealFlights
-        from rt_torchrl.systems.collectors import EpisodeCollector
+        from rt_torchrl.systems.collectors import collector_of
 
         if isinstance(policy, RealController):
             return policy.fly_real(self._count, seed=UNSEEN_SEED)
         generator = torch.Generator(device=self.initial_state.device)
         actor = LivePolicy(self.plant, policy, ExplorationConfig(), generator=generator)
-        rollout = EpisodeCollector(self._system, actor, self.plant).rollout
+        rollout = collector_of(self._system, actor, self.plant).rollout
         flights = RealFlights(self._system, actor, rollout, self.plant)
         state = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
