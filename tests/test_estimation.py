@@ -166,7 +166,8 @@ def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
 
 
 def test_noise_of_the_sensors_decides_whether_first_states_are_estimated():
-    """A line that bends is no noise, and neither is an exact one; the paper's descent knows measured ones alone."""
+    """A line that bends is no noise, and neither is an exact one. The paper's descent knows measured ones alone, and
+    its twin the noise."""
     noisy, times, fits = lines(), 0.1 * np.arange(101), []
     exact = [line_segment(3.0 + (0.4 + 0.2 * z) * times, wind=z) for z in WINDS]
     bent = [line_segment(3.0 + 0.4 * times + 0.05 * times**2, wind=z) for z in WINDS]
@@ -182,6 +183,7 @@ def test_noise_of_the_sensors_decides_whether_first_states_are_estimated():
         initial = "estimated" if estimates else "measured"
         asked = assimilation(Line(), given, initial=initial, **options).update(records)
         assert fit.estimates == estimates and torch.equal(chosen.w, given.w) and found == asked
+        assert fit.twin.noise.tolist() == pytest.approx([1.0 if records is noisy else 0.0], rel=0.2)
         fits.append(fit)
     fits[-1].load_state_dict(fits[0].state_dict())
     assert fits[-1].estimates and fits[-1].rms_errors(noisy).keys() == {"position [m]"}

@@ -96,25 +96,25 @@ class Assimilation:
             return self._descend_anew(whole)
         before, damping = copy.deepcopy(self.twin.closure.state_dict()), self.damping
         descended, config = self._fit(whole), self.config
-        chooses = config.initial is None and (config.method, config.inputs) == ESTIMABLE
-        if chooses and not self.estimates and self._noisy(whole):
+        noisy = self.estimates or (config.initial is None and self._noisy())
+        if noisy and not self.estimates and (config.method, config.inputs) == ESTIMABLE:
             self._estimate_first_states(True)
             self.twin.closure.load_state_dict(before)
             self.damping = damping
             descended = self._fit(whole)
-        if self.estimates:
+        if noisy or self.twin.noise.any():
             with contextlib.suppress(FloatingPointError):
                 self.twin.noise = noise_levels(self.twin, records)
         return descended
 
-    def _noisy(self, whole: Trajectory) -> bool:
+    def _noisy(self) -> bool:
         """Whether the sensors have noise, as the present twin tells; not asked where errors are tiny."""
-        sensors = self._problem.sensors
+        sensors, whole = self._problem.sensors, batch_of(self._records)
         scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, whole))
         if (self._rms(self.in_segments(whole)) <= SURE * EXPLAINED * scatter).all():
             return False
         with contextlib.suppress(FloatingPointError):
-            return bool(noise_levels(self.twin, whole.each()).any())
+            return bool(noise_levels(self.twin, self._records).any())
         return False
 
     def _fit(self, whole: Trajectory) -> Descended:

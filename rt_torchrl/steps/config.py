@@ -155,7 +155,8 @@ class AssimilationConfig:
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
             None lets the data choose: ``estimated`` from the first fit on that leaves noise of the sensors, see
-            :func:`rt_torchrl.fit.sensors.noise_levels`, of more than 1 % of the scatter of what they read.
+            :func:`rt_torchrl.fit.sensors.noise_levels`, of more than 1 % of the scatter of what they read. Whichever
+            method fits, flights on the twin then have this noise.
     """
 
     iterations: Count = 30
