@@ -5,12 +5,15 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
+from seeds_and_numbers import seeded
 from test_algorithm import twinning, weights
 from test_belief import EPISODES, REFUTED, Hasty, belief_of, gains, said
 from test_first_controller import begun
+from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl import Descended, DescentConfig, DigitalTwin, Scenario
+from rt_torchrl import Descended, DescentConfig, DigitalTwin, SaturatedAffine, Scenario
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps import plan
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import AssimilationConfig, ExogenousConfig, PlannerConfig
@@ -208,6 +211,15 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(dear, im
     monkeypatch.setattr(found.virtual, "judge", judged)
     found.start()
     assert drawn == 2 * ([4, 8] if imitates_there else [4])  # both policies
+
+
+def test_an_imitation_of_a_jump_keeps_weights_with_gradients():
+    imitation, plant = begun().steps["switch"].imitation, LinearQuadratic()
+    pupil = SaturatedAffine(2, plant.actions, generator=seeded(0))
+    observations = torch.randn(500, 2, generator=seeded(1), dtype=torch.float64)
+    low, high = bounds(plant.actions)
+    error = imitation._match(pupil, [(observations, torch.where(observations[:, :1] > 0.0, high, low))])
+    assert error < 0.1 and parameters_to_vector(pupil.parameters()).abs().max() < 1e3
 
 
 def test_a_random_start_has_drawn_weights_where_layers_share_them():

@@ -146,7 +146,8 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
 
     first = {"expected": 3.0, "paid": 2.0}
     assert "the live policy is not clearly better than PI: keep it" in said(live, 0.5 * cost, greatest=2.1)
-    assert "the live policy is not clearly better than PI: keep it" in said(live, 1.1 * cost, greatest=1.01)
+    for greatest in (1.01, 0.9995):  # a gain of rounding is none
+        assert "the live policy is not clearly better than PI: keep it" in said(live, 1.1 * cost, greatest=greatest)
     for high in (0.8, 1.2):  # flights on a real system whose episodes are never the same
         flown = {
             live: {"J_a": {"mean": 1.0, "confidence_interval": [0.7, high]}},

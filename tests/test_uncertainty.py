@@ -1,6 +1,7 @@
 """Standard errors, simulations and counted intervals, against closed forms and Monte Carlo."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -138,6 +139,16 @@ def test_standard_errors_are_those_of_regression_with_correlated_noise():
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
     # that in the error; the window takes another few per cent of the correlation and of the trend.
     assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
+
+
+@pytest.mark.parametrize("size", [0.05, 1e-6])
+def test_alike_residuals_are_told_with_their_size_beyond_rounding(size):
+    wave = size * np.sin(2.0 * np.pi * TIMES / 2.0)
+    record = sensor_record(Line(), position(), line_segment(0.5 * TIMES + wave))
+    notes = " ".join(Estimation(DigitalTwin(Line(), Slope()), position()).run([record]).warnings())
+    found = re.search(r"position \(correlation (0.9\d), RMS (\S+) m\) are alike", notes)
+    assert (found is not None) == (size > 1e-3)
+    assert found is None or float(found[2]) == pytest.approx(size / math.sqrt(2.0), rel=0.1)
 
 
 def test_standard_errors_hold_noise_that_drives_the_system():

@@ -51,6 +51,8 @@ GROWTH = 1e3
 """Factor by which errors of first states grow along the records of a system that is called unstable."""
 ALIKE = 0.5
 """Correlation of neighbouring residuals above which they are no noise."""
+ROUNDED = 1e-4
+"""RMS error of a sensor, as a share of the scatter of its readings, that is rounding, such as of single precision."""
 DEPARTURE = 3.0
 """Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""
 SHORTENED = 3
@@ -460,8 +462,13 @@ def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
 
 def not_white(likelihood: Likelihood) -> str:
     """What residuals that are no noise say of the standard errors; empty where neighbours are hardly alike."""
-    pairs = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), strict=True)
-    alike = ", ".join(f"{sensor.name} ({value:.2g})" for sensor, value in pairs if value > ALIKE)
+    rms, scatter = judged(likelihood).rms, scatter_of(likelihood.sensors, likelihood.records)
+    rows = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), rms.tolist(), scatter.tolist(), strict=True)
+    alike = ", ".join(
+        f"{sensor.name} (correlation {value:.2g}, RMS {error:.2g} {sensor.measurement.unit})"
+        for sensor, value, error, size in rows
+        if value > ALIKE and error > ROUNDED * size
+    )
     words = (
         f"neighbouring residuals of {alike} are alike: noise drives the system, which robust standard errors hold, or "
         "the twin lacks something, steps or reads too coarsely, which no standard errors hold"

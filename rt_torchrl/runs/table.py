@@ -16,6 +16,8 @@ MOST_WEIGHTS = 12
 """Greatest number of weights of the closure that the table shows."""
 MOST_CORRELATIONS = 3
 """Greatest number of correlations of errors that the table shows."""
+RELEVANT = 1e-3
+"""Share of a cost that counts as a gain; less is rounding, whatever its interval is."""
 MOST_ERRORS = 2
 """Number of RMS errors of the twin on the progress line."""
 WHERE = {
@@ -249,16 +251,16 @@ def dearer_than_first(summary: Mapping[str, Any]) -> str:
 
 
 def clearly_cheaper(summary: Mapping[str, Any], name: str) -> bool:
-    """Whether the live policy costs less than a controller, with 95 % confidence.
+    """Whether the live policy costs less than a controller by a share that counts, with 95 % confidence.
 
     The ratio tells it, or disjoint intervals on a real system whose flights were not of the same episodes.
     """
     judged, _ = judged_at_the_end(summary)
     entry, (_, greatest) = judged[name], judged[summary["live"]]["J_a"]["confidence_interval"]
     if "ratio" not in entry:
-        return bool(greatest < entry["J_a"]["confidence_interval"][0])
+        return bool(greatest < (1.0 - RELEVANT) * entry["J_a"]["confidence_interval"][0])
     greatest = entry["ratio"]["confidence_interval"][1]
-    return greatest is not None and greatest < 1.0
+    return greatest is not None and greatest < 1.0 - RELEVANT
 
 
 def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
@@ -284,7 +286,8 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     elif rival is not None:
         steps.append(
             f"the live policy is not clearly better than {rival}: keep it, let the policy observe what it computes, "
-            "train with more --twinning.planner.iterations, or judge both in more episodes (--unseen, --real-unseen); "
+            "take --policy mlp, train with more --twinning.planner.iterations, or judge both in more episodes "
+            "(--unseen, --real-unseen); "
             f"rt_torchrl.diagnose({call}) says why"
         )
     elif summary["better"] != live:

@@ -38,6 +38,8 @@ STALL = 0.5
 """Relative weight change T_w below which the idle policy has stalled; P_w decides how soon that makes it a clone."""
 ITERATIONS = 200
 """Gradients of the imitation loss in each round (L-BFGS on all observations at once)."""
+RIDGE = 1e-8
+"""Price of the sum of squares of weights. None imitate a jump: without a price they grow until gradients vanish."""
 SAMPLES = 5000
 """Greatest number of observations from each source; a source with more is thinned evenly."""
 BLOWN_UP = 1e3
@@ -277,9 +279,12 @@ class Imitation:
         low, high = bounds(self.virtual.twin.plant.actions, device=observations.device)
         target = (actions - low) / (high - low)
 
+        weights = [weight for weight in pupil.parameters() if weight.requires_grad]
+
         def loss() -> Tensor:
             shares = (pupil(observations) - low) / (high - low)
-            return nn.functional.mse_loss(shares, target, reduction="none").mean()
+            size = torch.stack([weight.square().sum() for weight in weights]).sum()
+            return nn.functional.mse_loss(shares, target) + RIDGE * size
 
         return Descent(pupil, DescentConfig(optimiser="lbfgs", rate=1.0)).run(loss, ITERATIONS).best ** 0.5
 
