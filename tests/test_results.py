@@ -155,6 +155,8 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         }
         told = said(live, 2.0 * cost, place="twin", real_unseen={"controllers": flown})
         assert ("not clearly better than PI" in told) == (high > 1.1)
+    for place in ("simulation without noise of the sensors", "simulation"):
+        assert ("--real-unseen 5" in said(live, 2.0 * cost, place=place)) == (place != "simulation")
     other = "model_free" if live == "model_based" else "model_based"
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
     told = said(live, 2.0 * cost, place="twin", first=first)

@@ -298,7 +298,7 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         steps.append(f"take the twin away, on which it plans: {call_of('export')} {folder} --what twin")
     else:
         steps.append(f"take the controller away: {call_of('export')} {folder} --role {live}")
-    if twin and "real_unseen" not in summary:
+    if (twin or place.startswith("simulation without")) and "real_unseen" not in summary:
         steps.append(
             "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
         )
