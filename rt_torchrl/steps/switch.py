@@ -38,7 +38,7 @@ STALL = 0.5
 """Relative weight change T_w below which the idle policy has stalled; P_w decides how soon that makes it a clone."""
 ITERATIONS = 200
 """Gradients of the imitation loss in each round (L-BFGS on all observations at once)."""
-RIDGE = 1e-8
+RIDGE = 1e-9
 """Price of the sum of squares of weights. None imitate a jump: without a price they grow until gradients vanish."""
 SAMPLES = 5000
 """Greatest number of observations from each source; a source with more is thinned evenly."""
