@@ -13,7 +13,7 @@ from test_uncertainty import position
 
 import rt_torchrl as rt
 from rt_torchrl.fit.least_squares import Estimation, judged
-from rt_torchrl.fit.sensors import known_sensors, read, read_slopes, segments
+from rt_torchrl.fit.sensors import known_sensors, read, read_slopes, scatter_of, segments
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import batch_of, identification_cost
 
@@ -48,6 +48,18 @@ def test_derivatives_are_those_of_backpropagation():
     # The same derivatives, forward instead of backward.
     assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_scatter_is_the_standard_deviation_and_not_the_distance_from_the_first_reading(periodic):
+    """Of a release from 2, and of an angle that goes over the end of its range."""
+    values = 2.0 * np.exp(-0.1 * np.arange(400)) + 0.05 * noise_of(400, 0)
+    angle = rt.Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=periodic)
+    readings = torch.from_numpy(angle.wrapped(values + 3.0 * periodic))[:, None]
+    record = rt.SensorRecord(readings, readings[1:], readings, readings[0])
+    record.readings[5:15] = math.nan
+    (scatter,) = scatter_of([rt.Sensor(measurement=rt.Measurement.of(angle))], [record]).tolist()
+    assert scatter == pytest.approx(np.delete(values, range(5, 15)).std(), rel=1e-12)
 
 
 def test_a_line_with_holes_is_fitted_as_by_regression():

@@ -189,7 +189,11 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
 
 
 def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """RMS difference of each sensor's readings from its first one.
+    r"""Standard deviation of each sensor's readings, in the unit of its signal.
+
+    .. math:: \sqrt{\overline{(d - \bar d)^2}}, \qquad d_k = y_k - y_1
+
+    where the differences d are taken the short way round if the signal is periodic.
 
     Raises:
         ValueError: if there is no record, or a sensor has no sample.
@@ -204,7 +208,7 @@ def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Fl
             raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
         origin = samples[:1].expand_as(samples)
         change = differences([sensor.measurement], samples[:, None], origin[:, None])
-        scatter.append(change.square().mean().sqrt())
+        scatter.append((change - change.mean()).square().mean().sqrt())
     return torch.stack(scatter)
 
 
