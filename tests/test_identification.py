@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from small_plants import Line, line_segment
+from seeds_and_numbers import seeded
+from small_plants import Line, line_segment, noise_of
 from test_export_recipe import recipe
+from torch import nn
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify, over_segments
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of
+from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
@@ -201,6 +204,35 @@ def test_a_twin_that_diverges_over_whole_records_begins_with_what_short_segments
     found = fit.update([record])
     assert fit.length == 0 and found.start == np.inf and found.best < 1e-10
     assert closure.coefficients.item() == pytest.approx(0.5, rel=1e-4)
+
+
+class Bent(nn.Module):
+    """a and a perceptron beside a y³."""
+
+    def __init__(self):
+        super().__init__()
+        self.a = PositiveCoefficients([1.3], names={"a": "1/s"})
+        self.correction = BoundedPerceptron([(-2.0, 2.0)], [0.1], hidden=(3,), generator=seeded())
+
+    def forward(self, state):
+        return self.a(state) + self.correction(state)
+
+
+def test_a_prior_holds_perceptrons_at_their_first_values_whatever_short_segments_told():
+    """The twin diverges over whole records, so that these are fitted from what short segments tell."""
+    t, closure = 0.1 * np.arange(101), Bent()
+    first = [w.detach().clone() for w in closure.correction.parameters()]
+    record = line_segment((0.5 + 0.5 * np.exp(2.0 * t)) ** -0.5 + 0.02 * noise_of(101, 0))
+    sensors, config = sensors_of(Runaway(), ["position"]), EstimationConfig(prior=10.0)
+    found = Estimation(DigitalTwin(Runaway(), closure), sensors, config=config).run(
+        [sensor_record(Runaway(), sensors, record)]
+    )
+    moved = sum((w - w0).square().sum().item() for w, w0 in zip(closure.correction.parameters(), first, strict=True))
+    assert (
+        found.segment == 0
+        and found.likelihood.prior.cost().item() == pytest.approx(5.0 * moved, rel=1e-9)
+        and moved > 1e-6
+    )
 
 
 def test_results_of_a_training_or_an_identification_are_not_overwritten(tmp_path):

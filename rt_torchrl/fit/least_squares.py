@@ -260,10 +260,11 @@ class Estimation:
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
         if self.config.segment is None and all(r.course is not None for r in records):
+        prior = WeightPrior(closure, self.config.prior) if self.config.prior else None
             likelihood, iterations, segment = self._longest(records)
         else:
             segment = self.config.segment or 0
-            likelihood, iterations = self._minimum(records, segment)
+            likelihood, iterations = self._minimum(records, segment, prior)
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
             before,
@@ -277,7 +278,9 @@ class Estimation:
             segment,
         )
 
-    def _minimum(self, records: Sequence[SensorRecord], length: int) -> tuple[Likelihood, int]:
+    def _minimum(
+        self, records: Sequence[SensorRecord], length: int, prior: WeightPrior | None
+    ) -> tuple[Likelihood, int]:
         """Fit records, or segments of a length, from several first weights, with the noise levels that they leave.
 
         It returns the likelihood at its minimum, and the number of trial steps.
@@ -288,7 +291,6 @@ class Estimation:
         closure, config = self.twin.closure, self.config
         if length:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
-        prior = WeightPrior(closure, config.prior) if config.prior else None
         generator, origin = torch.Generator().manual_seed(0), copy.deepcopy(closure.state_dict())
         least, weights, iterations = math.inf, origin, 0
         for number in range(1 + config.starts):
@@ -315,7 +317,7 @@ class Estimation:
                 break
         return best, iterations
 
-    def _longest(self, records: Sequence[SensorRecord]) -> tuple[Likelihood, int, int]:
+    def _longest(self, records: Sequence[SensorRecord], prior: WeightPrior | None) -> tuple[Likelihood, int, int]:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones.
 
         It returns what :meth:`_minimum` does, with the steps of all fits, and the length of the segments.
@@ -329,7 +331,7 @@ class Estimation:
             nonlocal steps
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
-            likelihood, iterations = self._minimum(records, length)
+            likelihood, iterations = self._minimum(records, length, prior)
             steps += iterations
             return (likelihood, length), judged(likelihood).rms
 
