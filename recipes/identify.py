@@ -151,6 +151,7 @@ def metrics_of(identified: Identified) -> dict[str, Any]:
         summary[side] = {"rms": {name: {"unit": unit, "error": error} for name, unit, error in rows}}
     summary["autocorrelation"] = dict(zip(names, autocorrelation(estimate.likelihood).tolist(), strict=True))
     summary["noise"], summary["bias"] = estimate.noise, estimate.biases
+    summary["bias_standard_error"] = uncertainty.bias_errors()
     errors, intervals = uncertainty.standard_errors(), uncertainty.intervals()
     summary["weights"] = {
         name: {
@@ -184,7 +185,8 @@ def table(metrics: dict[str, Any]) -> str:
         for side in ("training", "held_out")
         for name, rms in metrics[side]["rms"].items()
     }
-    errors = {key: metrics[key] for key in ("noise", "bias")} | {"neighbours' correlation": metrics["autocorrelation"]}
+    errors = {key.replace("_", " "): metrics[key] for key in ("noise", "bias", "bias_standard_error")}
+    errors["neighbours' correlation"] = metrics["autocorrelation"]
     weights = {name: {key: entry[key] for key in SHOWN} for name, entry in metrics["weights"].items()}
     frame = pandas().DataFrame
     blocks = [frame(of_sensors).T, frame(errors), frame(weights).T]

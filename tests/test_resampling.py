@@ -352,7 +352,8 @@ def test_the_room_is_identified_from_a_file(room_log, capsys):
         assert entry["interval"][0] < entry["after"] < entry["interval"][1]
     assert metrics["held_out"]["rms"]["air"]["error"] == pytest.approx(0.05, rel=0.4)  # 50 samples
     assert 0.0 < metrics["initial_states"][0]["wall"][1] < 1.0
-    assert re.search(r"noise.*\nair +0\.0", capsys.readouterr().out)
+    assert re.search(r"noise +bias +bias standard error.*\nair +0\.0", capsys.readouterr().out)
+    assert metrics["bias_standard_error"] == {"air": 0.0}
     closure = Envelope(torch.ones(3))
     closure.load_state_dict(torch.load(results / "weights.pt", weights_only=True)["closure"])
     assert closure.coefficients.tolist() == pytest.approx([entry["after"] for entry in weights.values()])

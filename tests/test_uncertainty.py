@@ -1,5 +1,6 @@
 """Standard errors, simulations and counted intervals, against closed forms and Monte Carlo."""
 
+import dataclasses
 import math
 import re
 
@@ -58,6 +59,28 @@ def test_errors_of_a_law_are_those_of_regression():
     found = estimate.uncertainty.errors_of(lambda: estimate.likelihood.twin.closure(z)).squeeze(-1)
     X = np.concatenate([np.ones((3, 1)), z], 1)
     np.testing.assert_allclose(found.numpy(), np.sqrt(np.diag(X @ exact_covariance() @ X.T)), rtol=1e-6)
+
+
+def test_errors_of_biases_are_those_of_regression():
+    """Of a second sensor of the position, beside one without bias; alone, it tells nothing of its bias."""
+    (first,) = position()
+    again = dataclasses.replace(first.measurement, name="again")
+    sensors = first, Sensor(measurement=again, noise=2.0 * NOISE, bias=True)
+    records = [
+        sensor_record(Line(), sensors, line_segment(0.5 * TIMES + NOISE * noise_of(81, k), wind=0.0)) for k in (0, 1)
+    ]
+    for record in records:
+        record.readings[:, 1] += 0.7
+    found = Estimation(DigitalTwin(Line(), Slope()), sensors).run(records)
+    starts = np.repeat(np.eye(2), 81, 0)
+    X = np.concatenate([np.tile(TIMES, 2)[:, None], starts, np.zeros((162, 1))], 1)
+    X = np.concatenate([X, (X + [0.0, 0.0, 0.0, 1.0]) / 2.0])  # in units of the noise of the first sensor
+    error = NOISE * math.sqrt(np.linalg.inv(X.T @ X)[3, 3])
+    assert found.biases["again"] == pytest.approx(0.7, abs=1e-6)
+    assert found.uncertainty.bias_errors() == pytest.approx({"position": 0.0, "again": error}, rel=1e-6)
+    alone = Estimation(DigitalTwin(Line(), Slope()), sensors[1:])
+    records = [record._replace(readings=record.readings[:, 1:]) for record in records]
+    assert alone.run(records).uncertainty.bias_errors() == {"again": math.inf}
 
 
 class InUnits(Slope):

@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from rt_torchrl.fit.likelihood import Likelihood
+from rt_torchrl.fit.likelihood import Likelihood, Offsets
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
@@ -156,14 +156,23 @@ class Uncertainty:
 
     def initial_errors(self) -> Float[Tensor, "records n_s"]:
         """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
-        initial, n = self.likelihood.initial, self.likelihood.weight_count
-        shape = initial.offsets.shape
-        places = slice(n, n + shape.numel())
+        return self._offset_errors(self.likelihood.initial, self.likelihood.weight_count)
+
+    def bias_errors(self) -> dict[str, float]:
+        """Standard error of every sensor's bias, in its unit; zero for one without, infinite where nothing is known."""
+        biases, names = self.likelihood.biases, [sensor.name for sensor in self.likelihood.sensors]
+        errors = self._offset_errors(biases, self.likelihood.count - biases.offsets.numel())
+        return dict(zip(names, errors.tolist(), strict=True))
+
+    def _offset_errors(self, values: Offsets, first: int) -> Float[Tensor, "*records n"]:
+        """Standard errors of values whose offsets begin at the place ``first`` among the unknowns."""
+        shape = values.offsets.shape
+        places = slice(first, first + shape.numel())
         variance = self.covariance.diagonal()[places].clone()
         axes = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[places]
         variance[self._inverse.unknown(axes)] = math.inf
-        errors = torch.zeros_like(initial.guess)
-        errors[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
+        errors = torch.zeros_like(values.guess)
+        errors[..., list(values.free)] = variance.sqrt().view(shape) * values.unit.sum(-1)
         return errors
 
     def warnings(self) -> list[str]:
