@@ -50,6 +50,14 @@ def test_derivatives_are_those_of_backpropagation():
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
 
 
+def test_samples_that_unknowns_fit_exactly_tell_no_noise_level():
+    """Segments of one interval have a sample and an unknown each; the first one has two, which tell the slope."""
+    segment, sensors = line_segment(0.1 * np.arange(81) + noise_of(81, 0)), rt.sensors_of(Line(), ["position"])
+    task = Estimation(rt.DigitalTwin(Line(), Slope()), sensors, config=rt.EstimationConfig(segment=1))
+    with pytest.raises(FloatingPointError, match="81 samples determine 81 unknowns and no level of the noise: measure"):
+        task.run([rt.sensor_record(Line(), sensors, segment)])
+
+
 @pytest.mark.parametrize("periodic", [False, True])
 def test_scatter_is_the_standard_deviation_and_not_the_distance_from_the_first_reading(periodic):
     """Of a release from 2, and of an angle that goes over the end of its range."""

@@ -256,12 +256,13 @@ class Estimation:
         Raises:
             ValueError: if there is no record, or a sensor has no sample.
             DivergenceError: if the twin diverges under the weights that it starts from.
+            FloatingPointError: if so many unknowns fit all samples that these tell no noise level.
         """
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
-        if self.config.segment is None and all(r.course is not None for r in records):
         prior = WeightPrior(closure, self.config.prior) if self.config.prior else None
-            likelihood, iterations, segment = self._longest(records)
+        if self.config.segment is None and all(r.course is not None for r in records):
+            likelihood, iterations, segment = self._longest(records, prior)
         else:
             segment = self.config.segment or 0
             likelihood, iterations = self._minimum(records, segment, prior)
@@ -389,12 +390,18 @@ class Estimation:
         equations = likelihood.normal_equations(blocks)
         if not equations.matrix.isfinite().all():
             raise FloatingPointError("the derivatives of finite states overflow")
-        inverse = inverse_information(equations.matrix).matrix
-        determined = likelihood.count - float((likelihood.priors()[0] * inverse.diagonal()).sum())  # by no prior
+        inverse = inverse_information(equations.matrix)
+        by_priors = float((likelihood.priors()[0] * inverse.matrix.diagonal()).sum())
+        determined = inverse.root.shape[1] - by_priors  # by samples
         given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
         squares = torch.stack([block.values.square().sum((0, 1)) for block in blocks]).sum(0)
         total = int(likelihood.samples.sum())
-        freedom = likelihood.samples * max(1.0 - determined / total, 1.0 / total)
+        if determined > total - 0.5 and not given.all():
+            raise FloatingPointError(
+                f"{total} samples determine {determined:.0f} unknowns and no level of the noise: measure more, fit "
+                "longer segments, or give every Sensor its noise"
+            )
+        freedom = likelihood.samples * (1.0 - determined / total)
         floor = LEAST_NOISE * first_noise(self.sensors, likelihood.records)
         levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
         levels = torch.where(given, likelihood.noise, levels)
