@@ -118,7 +118,7 @@ def guess(readings: Tensor) -> Tensor:
 def sensor_record_of(voltage: np.ndarray, level: np.ndarray) -> rt.SensorRecord:
     """A record of the benchmark; the voltage of the last sample acts on nothing."""
     readings, actions = torch.tensor(level).double()[:, None], torch.tensor(voltage).double()[:-1, None]
-    return rt.SensorRecord(readings, actions, torch.zeros_like(actions), guess(readings[0]))
+    return rt.SensorRecord(readings, actions, torch.zeros_like(readings), guess(readings[0]))
 
 
 def level_figure(record: rt.SensorRecord, readings: Tensor, title: str) -> "Figure":

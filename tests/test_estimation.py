@@ -19,14 +19,19 @@ from rt_torchrl.trajectories.trajectory import batch_of, identification_cost
 
 
 def test_derivatives_are_those_of_backpropagation():
-    """Of a nonlinear sensor with a bias, over records of two lengths with holes, against the adjoint's."""
+    """Of a nonlinear sensor with a bias, over records of two lengths with holes, against the adjoint's.
+
+    The sensor reads the input. That of the last sample is known of the second record alone.
+    """
     plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
-    read_product = lambda plant, t, s, z: s[..., 0] * s[..., 1] + t + z[..., 0]  # noqa: E731
+    read_product = lambda plant, t, s, z: s[..., 0] * (s[..., 1] + z[..., 0]) + t  # noqa: E731
     product = rt.Measurement(symbol="p", name="product", unit="m^2/s", read=read_product)
     sensors = (*rt.sensors_of(plant, ["position"]), rt.Sensor(measurement=product, bias=True))
     twin = rt.DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
     records = [rt.sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (12, 7))]
     records[0].readings[3:5, 0] = math.nan
+    assert [record.readings[-1].isnan().tolist() for record in records] == [[False, True]] * 2
+    records[1].exogenous[-1], records[1].readings[-1, 1] = 0.7, 0.2
     spread = torch.tensor([math.inf, 2.0]).double()
     task = Estimation(twin, sensors, spread=spread)
     likelihood = task.likelihood(records, torch.tensor([0.1, 0.3]).double())
@@ -37,9 +42,11 @@ def test_derivatives_are_those_of_backpropagation():
 
     first, cost = likelihood.initial(), 0.0
     for k, record in enumerate(records):
-        flown_again = twin.replay(first[k : k + 1], record.exogenous[None], record.actions[None], start=record.start)
+        flown_again = twin.replay(
+            first[k : k + 1], record.exogenous[None, :-1], record.actions[None], start=record.start
+        )
         t = record.start + plant.dt * torch.arange(len(record.readings)).double()
-        inputs = torch.cat([record.exogenous, record.exogenous[-1:]])
+        inputs = record.exogenous.nan_to_num()  # where it is not known there is no reading
         error = read(sensors, plant, t, flown_again.states[0], inputs) + likelihood.biases() - record.readings
         cost = cost + 0.5 * ((error / likelihood.noise).nan_to_num() ** 2).sum()
     cost = cost + 0.5 * (((first - likelihood.initial.guess) / spread) ** 2).sum()
@@ -48,6 +55,9 @@ def test_derivatives_are_those_of_backpropagation():
     # The same derivatives, forward instead of backward.
     assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
     assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
+    assert [bool(readings[-1, 1].isnan()) for readings in likelihood.simulated()] == [True, False]
+    with pytest.raises(ValueError, match="record 0 has 12 actions, 13 readings and 12 exogenous inputs; it must have"):
+        task.run([records[0]._replace(exogenous=records[0].exogenous[:-1])])
 
 
 def test_samples_that_unknowns_fit_exactly_tell_no_noise_level():

@@ -8,12 +8,13 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from seeds_and_numbers import seeded
-from small_plants import Line, line_segment, noise_of
+from small_plants import Line, Slope, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, Plant, PositiveCoefficients, Rollout, Signal
+from rt_torchrl import AssimilationConfig, DigitalTwin, Measurement, Plant, PositiveCoefficients, Rollout, Signal
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify, over_segments
+from rt_torchrl.fit.log import SensorLog
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensor_record, sensor_records, sensors_of
 from rt_torchrl.plants.closures import BoundedPerceptron
@@ -48,6 +49,35 @@ def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise()
         assert (side.rms < 0.01).all()  # what is left is the sensors' noise, 0.5 % of signals of some 0.5
     # Interpolation between two noisy samples shares them: about a quarter, here within ±0.25.
     assert ((alike := autocorrelation(found.estimate.likelihood)) > 0.0).all() and (alike < 0.5).all()
+
+
+class Windy(Line):
+    """A line of which a sensor reads the position and twice the wind."""
+
+    measurements = (
+        Measurement(symbol="y", name="both", unit="m", read=lambda p, t, s, z: s[..., 0] + 2.0 * z[..., 0]),
+    )
+
+
+@pytest.mark.parametrize("segment", [0, 3])
+def test_a_sensor_of_an_input_reads_that_of_its_own_sample(segment):
+    """At the ends of records, segments and parts that are held out, too: without noise the true weights stay."""
+    plant, times, wind = Windy(), 0.1 * np.arange(41), np.random.default_rng(0).normal(size=41)
+    position = 1.0 + np.append(0.0, np.cumsum(0.1 * (0.5 + 0.3 * wind[:-1])))
+    log = SensorLog(
+        times=times, columns={"position": position, "wind": wind, "nothing": 0.0 * times, "both": position + 2.0 * wind}
+    )
+    parts, sensors = resample(log, plant), sensors_in(plant, log, ["both"])
+    sides = hold_out(parts.segments, plant.dt, 0.25)
+    records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in sides]
+    assert [record.exogenous[-1].item() for side in records for record in side] == pytest.approx([wind[30], wind[40]])
+    closure = Slope()
+    torch.nn.init.ones_(closure.w)
+    found = identify(
+        Estimation(DigitalTwin(plant, closure), sensors, config=EstimationConfig(segment=segment)), *records
+    )
+    assert closure.w.tolist() == pytest.approx([0.5, 0.3], abs=1e-6)
+    assert max(found.training.rms.item(), found.held_out.rms.item()) < 1e-6
 
 
 class Joints(PositiveCoefficients):

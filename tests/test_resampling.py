@@ -200,6 +200,8 @@ def test_held_signals_are_averaged_over_the_interval():
     held = values[np.searchsorted(times, fine, side="right") - 1].reshape(44, 1000).mean(-1)
     # At most two steps an interval, each up to 4 high and wrong by at most a thousandth of the interval.
     np.testing.assert_allclose(found, held, atol=8e-3)
+    # Half of 2 and half of 5; then the last value.
+    assert hold_means(np.arange(2.0), np.array([2.0, 5.0]), np.array([0.5, 1.5, 2.5])).tolist() == [3.5, 5.0]
 
 
 def test_gaps_split_and_short_parts_are_left_out_and_told():
@@ -329,7 +331,7 @@ def room_log(tmp_path):
     """The first record of the room as a file, and the class of the room beside it."""
     _, _, (record, _) = room_records()
     rows = {"time": 300.0 * np.arange(200), "air": record.readings[:200, 0]}
-    rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:, 0]}
+    rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:200, 0]}
     pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
     text = (TESTS / "small_plants.py").read_text()
     made = "    def make_closure(self, generator):\n        return Envelope(torch.tensor([30.0, 150.0, 8.0]))\n\n"

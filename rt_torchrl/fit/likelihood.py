@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from rt_torchrl.fit.sensors import Sensor, SensorRecord, held_to_the_end, read, read_slopes, scatter_of, state_places
+from rt_torchrl.fit.sensors import Sensor, SensorRecord, read, read_slopes, scatter_of, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import Actions, Inputs, States
+from rt_torchrl.plants.shapes import Actions, States
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -91,7 +91,7 @@ class Group(NamedTuple):
     readings: Float[Tensor, "batch samples n_y"]
     seen: Bool[Tensor, "batch samples n_y"]
     actions: Actions
-    exogenous: Inputs
+    exogenous: Float[Tensor, "batch samples n_z"]
     times: Float[Tensor, "batch samples"]
     places: Int[Tensor, "batch n_local"]
 
@@ -122,6 +122,9 @@ class Likelihood:
         weights: whether the closure's weights are unknowns.
         known: whether to take the initial states as known, and biases as zero.
         biases: known biases; None lets those that are wanted be unknowns, which come last.
+
+    Raises:
+        ValueError: if a record of n actions has not n+1 readings and n+1 exogenous inputs.
     """
 
     def __init__(
@@ -137,6 +140,13 @@ class Likelihood:
         known: bool = False,
         biases: Float[Tensor, " n_y"] | None = None,
     ):
+        for k, (readings, actions, exogenous, *_) in enumerate(records):
+            if not len(readings) == len(exogenous) == len(actions) + 1:
+                raise ValueError(
+                    f"record {k} has {len(actions)} actions, {len(readings)} readings and {len(exogenous)} exogenous "
+                    "inputs; it must have one more reading and input than actions. Add the input of the last reading, "
+                    "or NaN if it is not known."
+                )
         noise = first_noise(sensors, records) if noise is None else noise
         first = torch.stack([record.guess for record in records])
         free = [] if known else (spread > 0.0).nonzero().flatten().tolist()
@@ -206,7 +216,7 @@ class Likelihood:
         """
         first, start, closure = self.initial()[group.numbers], group.times[:, 0], self.twin.closure
         free = bool(self.initial.free)
-        ends, S = self.twin.sensitivities(first, group.exogenous, group.actions, start=start, initial=free)
+        ends, S = self.twin.sensitivities(first, group.exogenous[:, :-1], group.actions, start=start, initial=free)
         require_finite(self.plant, ends.transpose(0, 1), first, [closure], start=start, remedy=REMEDY)
         by_weights, by_state = S.split([self.weight_count, S.shape[-1] - self.weight_count], -1)
         S = by_weights[..., : self._unknown_weights]
@@ -233,21 +243,23 @@ class Likelihood:
         values = differences([sensor.measurement for sensor in self.sensors], readings, group.readings)
         values = torch.where(group.seen, values, 0.0) * weights
         if None in self._states:
-            arguments = (self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous))
-            jacobian = read_slopes(*arguments) @ S
+            jacobian = read_slopes(self.sensors, self.plant, group.times, states, group.exogenous) @ S
         else:
             jacobian = S[:, :, self._states]
         by_bias = self.biases.unit.T.expand(*values.shape, -1)
-        jacobian = torch.cat([jacobian, by_bias], -1) * weights.unsqueeze(-1)
+        jacobian = torch.cat([jacobian, by_bias], -1)
+        jacobian = torch.where(group.seen.unsqueeze(-1), jacobian, 0.0) * weights.unsqueeze(-1)
         return Residuals(group, values, jacobian)
 
     def _read(self, group: Group, states: States) -> Float[Tensor, "batch samples n_y"]:
         """What the sensors read, bias included."""
-        return read(self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous)) + self.biases()
+        return read(self.sensors, self.plant, group.times, states, group.exogenous) + self.biases()
 
     @torch.no_grad()
     def simulated(self) -> list[Float[Tensor, "samples n_y"]]:
         """What the sensors would read along every record, bias included, whether there is a sample or not.
+
+        NaN where they depend on inputs that are not known, as in the last sample of a flight.
 
         Raises:
             DivergenceError: if a state is not finite.
@@ -255,7 +267,7 @@ class Likelihood:
         readings: dict[int, Tensor] = {}
         for group in self.groups:
             first, start = self.initial()[group.numbers], group.times[:, 0]
-            flown = self.twin.replay(first, group.exogenous, group.actions, start=start)
+            flown = self.twin.replay(first, group.exogenous[:, :-1], group.actions, start=start)
             readings |= dict(zip(group.numbers, self._read(group, flown.states), strict=True))
         return [readings[number] for number in range(len(self.records))]
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from rt_torchrl.fit.log import TIME, Rows, SensorLog, logged_states
 from rt_torchrl.fit.sensors import Sensor, SensorRecord, known_sensors, sensors_of
@@ -127,22 +128,27 @@ def hold_out(
 
 
 def hold_means(times: Rows, values: Rows, grid: Samples) -> Float[np.ndarray, " intervals"]:
-    """Exact means, over every interval of a grid, of a signal that holds its value from each time to the next."""
-    integral = np.append(0.0, np.cumsum(values[:-1] * np.diff(times)))
+    """Exact means, over every interval of a grid, of a signal that holds its value from each time to the next.
+
+    It holds its last value on.
+    """
+    times = np.append(times, max(times[-1], grid[-1]) + 1.0)
+    integral = np.append(0.0, np.cumsum(values * np.diff(times)))
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
+
+
+def _held(log: SensorLog, rows: slice, signals: Sequence[Signal], grid: Samples) -> Float[Tensor, "intervals signals"]:
+    values = np.empty((len(grid) - 1, len(signals)))  # a plant may have no inputs
+    for k, signal in enumerate(signals):
+        values[:, k] = hold_means(log.times[rows], log.columns[signal.name][rows], grid)
+    return torch.from_numpy(values)
 
 
 def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajectory:
     times = log.times[rows]
     grid = times[0] + plant.dt * np.arange(steps + 1)
-
-    def held(signals: Sequence[Signal]) -> Float[Tensor, "n n_held"]:
-        values = np.empty((steps, len(signals)))  # a plant may have no inputs
-        for k, signal in enumerate(signals):
-            values[:, k] = hold_means(times, log.columns[signal.name][rows], grid)
-        return torch.from_numpy(values)
-
-    actions, exogenous = held(plant.actions), plant.with_previews(held(plant.acting_inputs)[None])[0]
+    actions = _held(log, rows, plant.actions, grid)
+    exogenous = plant.with_previews(_held(log, rows, plant.acting_inputs, grid)[None])[0]
     measured = {TIME: torch.from_numpy(grid)}
     for state in logged_states(plant):
         if state.name in log.columns:
@@ -248,7 +254,7 @@ def logged_readings(
     There is a sample at the control instant nearest to each row that the sensor has, and nowhere else: what is
     interpolated between rows is no measurement. The time from the row to that instant is interpolated, between the two
     rows around it; the sample is missing if these are further apart than ``gap`` [s], or rows were left out between
-    them.
+    them. In the last sample sensors read the inputs that the log holds from there on; previews of these are not known.
 
     Args:
         log: the log, with NaN where a sensor lacks a sample.
@@ -261,8 +267,10 @@ def logged_readings(
     rows = _around(log, grid)
     values = [_samples(s.measurement, log.times[rows], log.columns[s.name][rows], grid, gap) for s in sensors]
     readings = torch.from_numpy(np.stack(values, -1))
+    inputs = _held(log, rows, plant.acting_inputs, grid[-1] + plant.dt * np.arange(2))
+    exogenous = torch.cat([segment.exogenous, pad(inputs, (0, len(plant.previews)), value=torch.nan)])
     states = segment.states
-    return SensorRecord(readings, segment.actions, segment.exogenous, states[0], float(segment.start), course=states)
+    return SensorRecord(readings, segment.actions, exogenous, states[0], float(segment.start), course=states)
 
 
 def _around(log: SensorLog, grid: Samples) -> slice:

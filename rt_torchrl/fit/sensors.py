@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Input, Inputs, State, States, Time
@@ -128,11 +129,14 @@ def read_slopes(
 ) -> Float[Tensor, "batch n n_y n_s"]:
     """Derivatives of the readings by the state, in every sample."""
 
-    def reading(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
-        return read(sensors, plant, t, state, z)
+    def slopes(sensor: Sensor) -> Tensor:  # of each alone, so that one that is NaN leaves the others
+        def reading(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
+            return read([sensor], plant, t, state, z).squeeze(-1)
 
-    slopes: Tensor = batched(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
-    return slopes
+        found: Tensor = batched(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
+        return found
+
+    return torch.stack([slopes(sensor) for sensor in sensors], -2)
 
 
 class SensorRecord(NamedTuple):
@@ -141,7 +145,8 @@ class SensorRecord(NamedTuple):
     Args:
         readings: what the sensors read in the samples t_0 ... t_n; NaN where a sample is missing.
         actions: actions that were applied in the n intervals.
-        exogenous: exogenous inputs z, held over the same intervals.
+        exogenous: exogenous inputs z, held over the same intervals, and in a last row those in t_n, which sensors alone
+            read; NaN where they are not known, as after a flight, and with them the readings that depend on them.
         guess: first guess of the state in t_0.
         start: time t_0 on the plant's clock [s].
         course: guesses of the states in all samples, from which parts of the record begin; None if there are none.
@@ -149,7 +154,7 @@ class SensorRecord(NamedTuple):
 
     readings: Float[Tensor, "n+1 n_y"]
     actions: Float[Tensor, "n n_a"]
-    exogenous: Float[Tensor, "n n_z"]
+    exogenous: Float[Tensor, "n+1 n_z"]
     guess: Float[Tensor, " n_s"]
     start: float = 0.0
     course: Float[Tensor, "n+1 n_s"] | None = None
@@ -167,7 +172,7 @@ class SensorRecord(NamedTuple):
         steps, samples = slice(first, last), slice(first, last + 1)
         course = None if self.course is None else self.course[samples]
         guess, start = self.guess if course is None else course[0], self.start + first * dt
-        return SensorRecord(self.readings[samples], self.actions[steps], self.exogenous[steps], guess, start, course)
+        return SensorRecord(self.readings[samples], self.actions[steps], self.exogenous[samples], guess, start, course)
 
 
 def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -> SensorRecord:
@@ -177,11 +182,15 @@ def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -
 
 @torch.no_grad()
 def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -> list[SensorRecord]:
-    """What sensors read along each trajectory of a batch; the first states are the guesses."""
+    """What sensors read along each trajectory of a batch; the first states are the guesses.
+
+    A trajectory has no inputs in its last sample, and so no readings there of sensors that depend on them.
+    """
     states, actions, exogenous, start, seen = batch
     first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(len(states))
     t = first.unsqueeze(-1) + plant.dt * torch.arange(states.shape[1], dtype=torch.float64, device=states.device)
-    readings = read(sensors, plant, t, states, held_to_the_end(exogenous))
+    exogenous = pad(exogenous, (0, 0, 0, 1), value=math.nan)
+    readings = read(sensors, plant, t, states, exogenous)
     if seen is not None:
         readings = torch.where(seen.unsqueeze(-1), readings, torch.nan)
     rows = zip(readings, actions, exogenous, states, first.tolist(), strict=True)
@@ -231,11 +240,6 @@ def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]
             part = part._replace(readings=readings)
         parts.append(part)
     return parts
-
-
-def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:
-    """Inputs of all samples; the last sample, which no interval follows, has those of the last interval."""
-    return torch.cat([exogenous, exogenous[..., -1:, :]], -2)
 
 
 @torch.no_grad()
