@@ -103,6 +103,29 @@ class LinearQuadratic(Plant):
         return LinearGain(0.1 * torch.randn(shape, generator=generator, dtype=torch.float64))
 
 
+class Slewing(LinearQuadratic):
+    """The same with a motor that changes its force by at most 0.1 N in an interval, from the last one, a state."""
+
+    states = (*LinearQuadratic.states, Signal(symbol="a", name="force", unit="N"))
+    controller_states = ("force",)
+
+    def actuate(self, state, command):
+        return torch.maximum(torch.minimum(command, state[..., 2:3] + 0.1), state[..., 2:3] - 0.1)
+
+    def latch(self, state, applied):
+        return torch.cat([state[..., :2], applied, state[..., 3:]], -1)
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state[..., :2], action, exogenous, closure)
+        return torch.cat([rates, torch.zeros_like(action)], -1)
+
+    def observe(self, t, state, exogenous):
+        return state[..., :2]
+
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, state[..., :2], applied, exogenous)
+
+
 def discretised():
     """Exact A_d, B_d over one interval, and the weights."""
     A, B, Q, R = (np.array(getattr(LinearQuadratic, name)) for name in "ABQR")

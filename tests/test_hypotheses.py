@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 from c_build import library, needs_compiler
-from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
-from seeds_and_numbers import drawn, stepped
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic, Slewing, discretised
+from seeds_and_numbers import double, drawn, stepped
 from small_runs import SMALL, small_run
 from test_export_recipe import recipe
 
@@ -95,6 +95,37 @@ def test_hidden_states_follow_from_what_was_read():
     with pytest.raises(DivergenceError, match="is not finite"):
         twin.followed(wild)
     assert misfit(twin, [wild], 5) == float("inf") > misfit(twin, [record], 5)  # which costs a hypothesis its weight
+
+
+@pytest.mark.parametrize("lag", [None, 0.25])
+def test_recorded_actions_act_as_they_are_on_what_is_behind_the_actuators(lag):
+    """A log whose force jumps is replayed without the rate limit, which commands pass; a lag follows the jumps."""
+    A, B, _, _ = discretised()
+    base = Slewing()
+    plant = base if lag is None else LaggedActuator(base, "force", lag)
+    forces, s, x = [1.5] * 10 + [-2.0] * 10, double(0.4, -0.1).numpy(), 0.0
+    states = [[*s, 0.0, *([] if lag is None else [x])]]
+    for a in forces:
+        off, decay = x - a, 0.0 if lag is None else math.exp(-base.dt / lag)
+        mean = a if lag is None else a + off * (1.0 - decay) * lag / base.dt
+        s, x = A @ s + B[:, 0] * mean, a + off * decay
+        states.append([*s, a, *([] if lag is None else [x])])
+    expected, actions = double(*states), double(*forces)[:, None]
+    record = rt.Trajectory(expected[:, :3], actions, torch.zeros(20, 1).double())
+    twin, again = rt.DigitalTwin(plant, plant.closure), reread(record, plant, 20)
+    start, given = expected[None, 0], (record.exogenous[None], record.actions[None])
+    flown = twin.replay(start, *given)
+    assert torch.equal(flown.actions[0], actions)
+    limited = rt.Rollout(plant, plant.closure)(start, *given)
+    assert limited.actions[0, :2, 0].tolist() == pytest.approx([0.1, 0.2])
+    found = [
+        flown.states[0],
+        torch.cat([start, twin.sensitivities(start, *given)[0][0]]),
+        twin.followed(record),
+        twin.of(Reread(plant)).replay(start, again.exogenous[None], again.actions[None]).states[0],
+    ]
+    for states in found:  # one Runge-Kutta step in an interval
+        torch.testing.assert_close(states, expected, rtol=0, atol=1e-5)
 
 
 def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_states():

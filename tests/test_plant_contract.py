@@ -106,7 +106,7 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     scale = states.abs().amax((0, 1))
     with torch.no_grad():
         flights = {
-            "commands": twin.replay(states[:, 0], exogenous, episode["action"]),
+            "commands": rt.Rollout(plant, plant.closure)(states[:, 0], exogenous, episode["action"]),
             "applied actions": twin.replay(states[:, 0], exogenous, episode["next", "applied"]),
             "policy": twin.control(policy, states[:, 0], exogenous),
         }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearQuadratic, Slewing
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
@@ -88,6 +88,15 @@ def test_its_entries_are_those_of_the_plant_itself(applied):
             torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-13)
         assert one["truncated"].item() == one["done"].item() == (k == 19) and not one["terminated"].item()
         found = one.exclude("reward")
+
+
+def test_a_controller_remembers_what_was_applied():
+    """Also where the machine's motor is faster than the plant's, of which it changes by 0.1 N at most."""
+    system = connected(Slewing(), rig=Rig(LinearQuadratic()), applied=Reading(keys=("motor",)), computes=True)
+    found = system.reset()
+    for force in (1.5, -2.0):
+        found = system.step(found.set("action", torch.full((1, 1), force).double()))["next"].exclude("reward")
+        assert found["state"][0, 2].item() == pytest.approx(force)
 
 
 def test_a_seed_fixes_every_episode_by_its_number():

@@ -219,9 +219,9 @@ def costs(calls: Calls) -> Iterator[str]:
     gaps = {
         "step: its applied action is not what actuate(state, command) gives; call actuate in step, because "
         "trajectories report its action": step.applied - applied,
-        "actuate: an applied action that is commanded again from the same state becomes another one; records hold "
-        "applied actions, and the twin replays them as commands. What limits nothing, such as a rotation, belongs into "
-        "vector_field": plant.actuate(arguments["state"], applied) - applied,
+        "actuate: an applied action that is commanded again from the same state becomes another one; where a safety "
+        "layer sends another action, that is recorded as the command, too. What limits nothing, such as a rotation, "
+        "belongs into vector_field": plant.actuate(arguments["state"], applied) - applied,
     }
     yield from (f"{text} (up to {gap.abs().max():.4g})." for text, gap in gaps.items() if (gap.abs() > size).any())
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, replaying
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -29,7 +29,7 @@ def visited_features(plant: Plant, closure: nn.Module, law: nn.Module, record: T
     states = record.states[:-1]
     clock = torch.arange(len(states), dtype=states.dtype, device=states.device)
     try:
-        plant.step(record.start + plant.dt * clock, states, record.actions, record.exogenous, closure)
+        replaying(plant).step(record.start + plant.dt * clock, states, record.actions, record.exogenous, closure)
     finally:
         hook.remove()
     return visited

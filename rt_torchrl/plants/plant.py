@@ -18,6 +18,7 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 :math:`-L_e/(1 - \gamma)`.
 """
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -383,6 +384,21 @@ class Plant(nn.Module):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
+
+
+def recorded(state: State, applied: Action) -> Action:
+    """The action that acts where a recorded one is given: the same one, which has passed the actuators already."""
+    return applied
+
+
+def replaying(plant: Plant) -> Plant:
+    """The plant under recorded actions, which :meth:`Plant.actuate` does not change again; it shares all else with it.
+
+    What an extension puts between the actuators and the system acts on recorded actions as on others.
+    """
+    same = copy.copy(plant)
+    vars(same)["actuate"] = recorded
+    return same
 
 
 def require_end_cost(plant: Plant) -> None:

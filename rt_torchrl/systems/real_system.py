@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase, GymWrapper
 
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.options import array_of
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, replaying
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import AroundSystem, at_end, at_start, declare_specs, ended_early, layers
 
@@ -204,7 +204,8 @@ class RealSystem(EnvBase):
         self.env, self.plant, self.closure = env, plant.to(device), closure
         self._state, self._applied, self._actuation = state, applied, actuation or Actuation()
         self._exogenous = () if exogenous is None else exogenous
-        self._controller = Controller(plant, nn.Identity()) if computes else None
+        # It advances under what was applied, which may be another action than the plant's actuators would let pass.
+        self._controller = Controller(replaying(plant), nn.Identity()) if computes else None
         self._read = plant.states
         if self._controller is not None:
             self._read = tuple(plant.states[k] for k in self._controller.measured)

@@ -48,7 +48,7 @@ class DivergenceError(FloatingPointError):
 
 
 class Rollout:
-    """Rolls a plant out under a closure, with commands from a record or with a policy in the loop.
+    """Rolls a plant out under a closure, with commands that are given or with a policy in the loop.
 
     Args:
         plant: the physics.
@@ -88,7 +88,7 @@ class Rollout:
         Args:
             initial_state: initial state s_0 of each realisation.
             exogenous: exogenous inputs z, held over each interval.
-            command: actions from a record; None if there is a policy.
+            command: commands to the actuators; None if there is a policy.
             start: time of s_0 [s], one for all realisations, or one for each.
 
         Raises:

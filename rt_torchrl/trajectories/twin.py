@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.plants.plant import Plant, require_end_cost
+from rt_torchrl.plants.plant import Plant, replaying, require_end_cost
 from rt_torchrl.plants.sensors import NoisySensors
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
@@ -66,8 +66,8 @@ class DigitalTwin:
         require_end_cost(plant)
         self.plant, self.closure = plant, closure
         self._engine = engine
-        self.replay = self._rollout(closure, None)
-        """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
+        self.replay = Rollout(replaying(plant), closure, engine=engine)
+        """Virtual episodes, or parts of them, under recorded actions as they are; see :meth:`Rollout.__call__`."""
         self.sensitivities = Sensitivities(plant, closure)
         self._planned: list[_Planned] = []
         self._read: ReadInterval | None = None
@@ -80,9 +80,6 @@ class DigitalTwin:
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
         return DigitalTwin(plant, self.closure, engine=able(self._engine, plant))
-
-    def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
-        return Rollout(self.plant, closure, policy, engine=self._engine)
 
     @torch.no_grad()
     def replayed(self, record: Trajectory, segment: int = 0) -> Float[Tensor, "samples n_s"]:
@@ -146,8 +143,8 @@ class DigitalTwin:
         commands = torch.cat([record.actions.expand(rows, -1, -1), readings[:, :-1]], -1)
         drive = drive_of(self.plant, record.exogenous.expand(rows, -1, -1), commands, start=record.start)
         # Kept, because the engine compares what is new to it with all that it knows, which takes milliseconds.
-        if self._read is None or self._read.plant is not self.plant or self._read.closure is not self.closure:
-            self._read = ReadInterval(self.plant, self.closure, None)
+        if self._read is None or self._read.closure is not self.closure:
+            self._read = ReadInterval(replaying(self.plant), self.closure, None)
         ends = Native().end_states(self._read, start, drive)
         require_finite(self.plant, ends, start, [self.closure], start=record.start)
         return torch.cat([start.unsqueeze(0), ends])
@@ -238,7 +235,7 @@ class DigitalTwin:
             if planned.serves(self.plant, self.closure, policy):
                 require_double("policy", policy)
                 return planned.rollout
-        rollout = self._rollout(constant(self.closure), policy)
+        rollout = Rollout(self.plant, constant(self.closure), policy, engine=self._engine)
         new = _Planned(self.closure, policy, rollout, Holdings(self.closure))
         self._planned = [new, *self._planned[: KEPT - 1]]
         return rollout
@@ -335,7 +332,7 @@ class Sensitivities:
     """
 
     def __init__(self, plant: Plant, closure: nn.Module):
-        self.interval = Interval(plant, closure, None)
+        self.interval = Interval(replaying(plant), closure, None)
         self._tangent = TangentInterval(self.interval, self._trained())
         self._engine = Native()
 
@@ -348,7 +345,7 @@ class Sensitivities:
         Args:
             initial_state: initial state s_0 of each trajectory.
             exogenous: exogenous inputs z, held over each interval.
-            actions: actions, held over each interval.
+            actions: actions as they were applied, held over each interval.
             start: time of s_0 [s], one for all trajectories or one for each.
             initial: append the n_s columns of ds_k/ds_0.
         """

@@ -20,7 +20,7 @@ from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.plant import Plant, Transition, replaying
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.vector_field import ResidualRates
 from rt_torchrl.steps.assimilate import Assimilation
@@ -79,7 +79,7 @@ class Reread(Extension):
     """
 
     def __init__(self, base: Plant):
-        super().__init__(base, [])
+        super().__init__(replaying(base), [])
         self._met, self._read = len(base.inputs), len(base.readings)
         readings = [Signal(symbol=s.symbol, name=f"read_{s.name}", unit=s.unit) for s in base.readings]
         self.inputs = (*base.inputs, *readings, Signal(symbol="r", name="is_read", unit="-"))
