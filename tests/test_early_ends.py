@@ -266,10 +266,41 @@ def test_a_plan_that_falls_from_a_rare_start_is_made_again_with_that_start():
 def test_an_end_where_the_plant_has_none_is_refused():
     plant = Falling()
     plant.reach = 100.0  # so that the plant goes on
-    env = connected(plant, rig=Rig(plant, ends_after=12, terminates=True, seed=3))
+    env = connected(plant, rig=Rig(plant, ends_after=12, seed=3))  # by a time limit
     found = algorithm(env, plant)
     with pytest.raises(ValueError, match=r"ended the episode after 12 of 50 .* does not end there.*end_cost"):
         found.episode()
+
+
+class Noisy(Rig):
+    """A rig that ends where the rod truly lies on the ground, and reads its state with noise."""
+
+    def __init__(self, seed):
+        super().__init__(Falling(), seed=seed, noise=0.1)
+
+    def _step(self, tensordict):
+        ended = super()._step(tensordict)
+        return ended.update({key: self.found[key][0].clone() for key in ("done", "terminated")})
+
+
+def test_an_episode_has_ended_where_the_system_says_so_whatever_noise_lets_be_read():
+    plant, policy, short = Falling(), LinearGain(WEAK), 0
+    for seed in range(6):
+        env, actor = connected(plant, rig=Noisy(seed)), actor_of(plant, policy)
+        flights = RealFlights(env, actor, EpisodeCollector(env, actor, plant).rollout, plant)
+        flight = flights.fly(policy, strength=0.0, whole=True)
+        states, actions, n = flight.record.states, flight.record.actions, len(flight.record.actions)
+        assert n < plant.n_steps and flight.whole and not flight.refused and not flights.faults
+        short += env.env.inner._state[0, 0].abs().item() > 1.0 > states[-1, 0].abs().item()
+        (q_x, _), (_, q_v), ((r,),) = *plant.Q, plant.R
+        total = sum(q_x * x**2 + q_v * v**2 for x, v in states[:-1].tolist()) + sum(
+            r * a**2 for (a,) in actions.tolist()
+        )
+        total += 0.5 * states[-1, 0].item() ** 2 / plant.dt + (plant.n_steps - n) * plant.end_cost
+        assert flight.cost.item() == pytest.approx(total / plant.n_steps, rel=1e-9)
+        assert flight.transitions["next", "terminated"].flatten().tolist() == [False] * (n - 1) + [True]
+        assert not flight.transitions["next", "truncated"].any()
+    assert short >= 2
 
 
 def test_what_does_not_go_with_ends_is_refused(tmp_path):

@@ -159,7 +159,7 @@ def at_start(plant: Plant, device: torch.device | None) -> dict[str, Tensor]:
     return {"applied": torch.zeros(1, len(plant.actions), dtype=torch.float64, device=device)} | flags
 
 
-def at_end(plant: Plant, cost: Cost, end: State, *, last: bool) -> dict[str, Tensor]:
+def at_end(plant: Plant, cost: Cost, end: State, *, last: bool, terminated: bool = False) -> dict[str, Tensor]:
     """The reward of a control interval, and whether the episode is over.
 
     Args:
@@ -167,15 +167,16 @@ def at_end(plant: Plant, cost: Cost, end: State, *, last: bool) -> dict[str, Ten
         cost: running cost of the interval.
         end: state at its end.
         last: whether the horizon is reached.
+        terminated: whether the system says that the episode has ended, whatever the state says.
 
     Returns:
         ``reward``, which has the cost at the end where the episode is over, and the flags.
     """
-    terminated = plant.ended(end).unsqueeze(-1)
-    truncated = ~terminated & last
-    done = truncated | terminated
+    over = plant.ended(end).unsqueeze(-1) | terminated
+    truncated = ~over & last
+    done = truncated | over
     reward = -(cost + done.squeeze(-1) * plant.terminal_cost(end) / plant.dt).unsqueeze(-1)
-    return {"reward": reward, "done": done, "terminated": terminated, "truncated": truncated}
+    return {"reward": reward, "done": done, "terminated": over, "truncated": truncated}
 
 
 def declare_specs(env: EnvBase, plant: Plant, *, refused: bool = False) -> None:

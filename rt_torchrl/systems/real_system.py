@@ -150,8 +150,9 @@ class RealSystem(EnvBase):
     State and exogenous input are read from the environment's report. Observation and reward are the plant's own
     functions of them, and so mean the same on the real system and on its twin; the environment's own reward is not
     used. An episode is as long as the plant's and takes one reset, at its beginning. It ends early in a state in which
-    the plant says so (:meth:`Plant.ended`), whether or not the environment ends it there. The environment must not end
-    an episode elsewhere, neither by a time limit nor by a terminal state of its own.
+    the plant says so (:meth:`Plant.ended`), whether or not the environment ends it there; if the plant may end at all,
+    it also ends where the environment terminates it, because a reading with noise may not show the end. The environment
+    must not end an episode elsewhere, neither by a time limit nor by a terminal state of its own.
 
     Args:
         env: TorchRL environment of one system, with batch size () or (1,); a Gymnasium environment goes into TorchRL's
@@ -330,7 +331,8 @@ class RealSystem(EnvBase):
             self._memory = self._controller.advance(*(values.cpu() for values in interval))
         end = self._joined(stepped["next"])
         cost = self.plant.running_cost(t, state, applied, exogenous)
-        ends = at_end(self.plant, cost, end, last=self._step_count >= self.plant.n_steps)
+        terminated = self.plant.end_cost is not None and bool(stepped["next", "terminated"].any())
+        ends = at_end(self.plant, cost, end, last=self._step_count >= self.plant.n_steps, terminated=terminated)
         if stepped["next", "done"].any() and not ends["done"].any():
             raise ended_early(self._step_count, self.plant)
         if ends["done"].any() and hasattr(self.env, "end_episode"):
