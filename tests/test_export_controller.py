@@ -7,9 +7,18 @@ import pytest
 import torch
 from c_build import library, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
-from seeds_and_numbers import seeded, stepped
+from seeds_and_numbers import double, seeded, stepped
 
-from rt_torchrl import Rollout, SaturatedAffine, Signal, export_controller, export_twin, shipped_plants
+from rt_torchrl import (
+    LaggedActuator,
+    Rollout,
+    SaturatedAffine,
+    Signal,
+    StackedObservations,
+    export_controller,
+    export_twin,
+    shipped_plants,
+)
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.export.controller import Controller
@@ -85,6 +94,45 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     torch.testing.assert_close(found[3:5], states[-2, 4:6], rtol=CLOSE, atol=CLOSE)
     ideal = Rollout(plant, plant.closure, policy, engine="autograd")(start, exogenous).states[0].detach()
     assert 1e-9 < ((states - ideal).abs() / size).max() < 2e-3
+
+
+@needs_compiler
+def test_a_controller_of_an_extended_plant_with_parameters(tmp_path):
+    """The lag is the machine's and no part of the controller, which holds the last two observations."""
+    plant = StackedObservations(LaggedActuator(LinearQuadratic(), "force", 0.3), 2)
+    policy = LinearGain([[1.0, 0.6, -0.3, 0.2, 0.1, -0.4]])
+    assert export_controller(policy, tmp_path / "stacked.c", plant, name="stacked") < CLOSE
+    in_c = InC(tmp_path / "stacked.c", 1, 4, 2)
+    start, exogenous = plant.draw_initial_state(1, seeded(1)), plant.draw_exogenous(1, seeded(2))
+    in_c.start(*start[0, :2].tolist())
+
+    def by_c(k, t, state, z):
+        return double(in_c.step(*state[0, :2].tolist()))
+
+    states, actions, _ = stepped(plant, plant.closure, start, exogenous, by_c)
+    past, expected = [start[:, :2]] * 2, list[torch.Tensor]()
+    for state in states[0, :-1, None, :2]:
+        expected.append(policy(torch.cat([state, *past], -1))[0])
+        past = [state, past[0]]
+    torch.testing.assert_close(actions[0], torch.stack(expected), rtol=0, atol=1e-12)
+
+
+def test_a_controller_state_that_depends_on_an_unknown_lag_is_refused(tmp_path):
+    class Summing(LinearQuadratic):
+        """With the integral of the force that acts, i."""
+
+        states = (*LinearQuadratic.states, Signal(symbol="i", name="impulse", unit="N s"))
+        controller_states = ("impulse",)
+
+        def vector_field(self, t, state, action, exogenous, closure):
+            return torch.cat([super().vector_field(t, state[..., :2], action, exogenous, closure), action], -1)
+
+        def observe(self, t, state, exogenous):
+            return state[..., 1:]
+
+    plant = LaggedActuator(Summing(), "force", 0.3)
+    with pytest.raises(ValueError, match=r"its states \(impulse\) depend on the closure"):
+        export_controller(LinearGain([[0.1, 0.2]]), tmp_path / "sum.c", plant)
 
 
 class Lagged(LinearQuadratic):

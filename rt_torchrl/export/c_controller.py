@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.export import c_file
-from rt_torchrl.export.agreement import SEED, action_sizes, detached, require_close
+from rt_torchrl.export.agreement import SEED, action_sizes, detached, frozen, require_close
 from rt_torchrl.export.controller import Controller
+from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.c_source import CSource, literal
 
@@ -199,7 +200,7 @@ def _traced(controller: Controller) -> dict[str, c_file.TracedFunction]:
     with torch.no_grad():
         example = {"t": now["t"], "memory": now["memory"], "last": measured, "command": act(**now)["command"]}
         example["measured"] = measured
-        controller.closure = UnknownClosure(plant.closure)
+        controller.closure = unknown(plant.closure)
         known = advance(**example)["next"].isfinite().all()
         parts["advance"] = c_file.traced(what, advance, example)
         controller.closure = plant.closure
@@ -209,6 +210,16 @@ def _traced(controller: Controller) -> dict[str, c_file.TracedFunction]:
             "which a controller does not know. Name in controller_states only what follows from measured signals."
         )
     return parts
+
+
+def unknown(closure: nn.Module) -> nn.Module:
+    """A closure of unknown coefficients; the parameters of extensions beside it are unknown, too."""
+    if not isinstance(closure, ExtendedClosure):
+        return UnknownClosure(closure)
+    own = frozen(closure.own)
+    for weight in own.parameters():
+        weight.fill_(math.nan)
+    return ExtendedClosure(unknown(closure.base), own)
 
 
 class UnknownClosure(nn.Module):
