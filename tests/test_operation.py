@@ -223,6 +223,38 @@ def test_a_run_goes_on_after_a_stop(tmp_path):
     assert len(found["episodes"]) > 2
 
 
+class Seasonal(LinearQuadratic):
+    """The oracle plant in a swing that pulls with a period of two seconds."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        pull = torch.sin(math.pi * t).unsqueeze(-1) + torch.zeros_like(action)
+        return super().vector_field(t, state, action, exogenous + pull, closure)
+
+
+class Shifting(LinearQuadratic):
+    """Its cost counts from the third second on."""
+
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, state, applied, exogenous) * (t > 3.0)
+
+
+class Clocked(LinearQuadratic):
+    def observe(self, t, state, exogenous):
+        return torch.stack([state[..., 0], torch.cos(math.pi * t) + 0.0 * state[..., 0]], -1)
+
+
+def test_windows_that_go_on_need_a_plant_that_is_the_same_in_each():
+    whole, part = {"horizon": 4.0}, {"horizon": 5.0}  # two periods, and two and a half
+    timed = [(Seasonal, part, "step"), (Shifting, part, "running_cost"), (Clocked, part, "observe")]
+    for kind, horizon, method in timed:
+        plant = kind(**horizon)
+        with pytest.raises(ValueError, match=f"at t = 0 again, but {method} of plant .* tell the time"):
+            InProcess(plant, {}, QUIET, as_reported(rt.PlantEnv(plant), plant), continuous=True)
+    for plant in (Seasonal(**whole), Clocked(**whole), rt.StackedObservations(LinearQuadratic(**part), 2)):
+        assert not module.answers_by_time(plant)
+    assert module.answers_by_time(rt.StackedObservations(Clocked(**part), 2)) == ["step", "observe"]
+
+
 def test_what_cannot_operate_is_refused(tmp_path):
     for make_env, continuous, message in (
         (lambda: rt.PlantEnv(SHORT), False, "cannot be sent to a process of its own"),

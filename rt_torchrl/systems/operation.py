@@ -25,6 +25,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds, differences
 from rt_torchrl.systems.collectors import fly, reset, together
 from rt_torchrl.systems.config import OperationConfig
 from rt_torchrl.systems.exploration import BumplessPolicy, ExplorationConfig
@@ -43,6 +44,10 @@ END = 10.0
 """Time that the acting process has to end the operation [s]."""
 SWITCH = 2e-4
 """Time for which a thread keeps Python's lock while the control loop waits for it [s]."""
+MOMENTS = 64
+"""Number of moments of an episode in which a plant is asked whether it depends on the time."""
+LATER = 1000
+"""Number of horizons, which is not reached, by which it is asked again later."""
 
 
 class Order(NamedTuple):
@@ -251,6 +256,33 @@ class Operator:
         self.follow(order, order.ready(self.policies))
 
 
+@torch.no_grad()
+def answers_by_time(plant: Plant) -> list[str]:
+    r"""Methods of a plant that answer otherwise whole horizons later, :math:`f(t + mT_o) \ne f(t)`.
+
+    They are called within episodes: at t = 0, where one begins, past observations do not count.
+    """
+    generator = torch.Generator().manual_seed(0)
+    state, inputs = plant.draw_initial_state(MOMENTS, generator), plant.draw_exogenous(MOMENTS, generator)[:, 0]
+    low, high = (end.nan_to_num(posinf=1.0, neginf=-1.0) for end in bounds(plant.actions))
+    action = low + (high - low) * torch.rand(MOMENTS, len(low), generator=generator, dtype=torch.float64)
+    k = torch.randint(1, max(plant.n_steps, 2), (MOMENTS,), generator=generator)
+    later = k + plant.n_steps * torch.randint(1, LATER, (MOMENTS,), generator=generator)
+
+    def answers(t: Tensor) -> dict[str, Tensor]:
+        end = plant.step(t, state, action, inputs, plant.closure).state
+        cost = plant.running_cost(t, state, action, inputs)
+        return {
+            "step": differences(plant.states, end, state),
+            "observe": plant.observe(t, state, inputs),
+            "running_cost": cost,
+        }
+
+    # A periodic function of a time that is a thousand horizons later has its rounding.
+    pairs = zip(answers(plant.dt * k.double()).items(), answers(plant.dt * later.double()).values(), strict=True)
+    return [name for (name, x), y in pairs if ((x - y).abs() > 1e-6 * x.abs().amax(0) + 1e-12).any()]
+
+
 class Operation:
     """A real system in operation: windows come in, and policies are handed over, while the learner learns.
 
@@ -271,7 +303,7 @@ class Operation:
 
     Raises:
         ValueError: if something that acts cannot be sent to another process, or the operation is to be continuous and
-            the system is no :class:`RealSystem`.
+            the system is no :class:`RealSystem`, or its plant depends on the time, see :func:`answers_by_time`.
     """
 
     def __init__(self, operator: Operator, system: EnvBase):
@@ -279,6 +311,13 @@ class Operation:
             raise ValueError(
                 f"continuous operation needs a RealSystem, which goes on without a reset; {type(system).__name__} does "
                 "not. Leave out --operation.continuous."
+            )
+        if operator.config.continuous and (timed := answers_by_time(operator.plant)):
+            raise ValueError(
+                f"continuous operation begins each window of {operator.plant.horizon:g} s at t = 0 again, but "
+                f"{' and '.join(timed)} of plant {operator.plant.name!r} tell the time of one window from that of "
+                "another. Give the horizon a whole number of the plant's periods, make what depends on the time a "
+                "measured input, or leave out --operation.continuous."
             )
         try:
             self._operator = pickle.dumps(operator)
