@@ -232,7 +232,8 @@ class DigitalTwin:
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""
         for planned in self._planned:
-            if planned.serves(self.plant, self.closure, policy):
+            same = planned.rollout.plant is self.plant and planned.closure is self.closure and planned.policy is policy
+            if same and planned.holdings.unchanged(self.closure):  # but for the values of its weights
                 require_double("policy", policy)
                 return planned.rollout
         rollout = Rollout(self.plant, constant(self.closure), policy, engine=self._engine)
@@ -248,11 +249,6 @@ class _Planned(NamedTuple):
     policy: nn.Module
     rollout: Rollout
     holdings: Holdings
-
-    def serves(self, plant: Plant, closure: nn.Module, policy: nn.Module) -> bool:
-        """Whether the rollout is of these, and nothing of the closure has changed but the values of its weights."""
-        same = plant is self.rollout.plant and closure is self.closure and policy is self.policy
-        return same and self.holdings.unchanged(closure)
 
 
 class ReadInterval(Interval):
