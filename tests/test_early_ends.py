@@ -275,8 +275,8 @@ def test_an_end_where_the_plant_has_none_is_refused():
 class Noisy(Rig):
     """A rig that ends where the rod truly lies on the ground, and reads its state with noise."""
 
-    def __init__(self, seed):
-        super().__init__(Falling(), seed=seed, noise=0.1)
+    def __init__(self):
+        super().__init__(Falling(), noise=0.1)
 
     def _step(self, tensordict):
         ended = super()._step(tensordict)
@@ -286,7 +286,7 @@ class Noisy(Rig):
 def test_an_episode_has_ended_where_the_system_says_so_whatever_noise_lets_be_read():
     plant, policy, short = Falling(), LinearGain(WEAK), 0
     for seed in range(6):
-        env, actor = connected(plant, rig=Noisy(seed)), actor_of(plant, policy)
+        env, actor = connected(plant, rig=Noisy(), seed=seed), actor_of(plant, policy)
         flights = RealFlights(env, actor, EpisodeCollector(env, actor, plant).rollout, plant)
         flight = flights.fly(policy, strength=0.0, whole=True)
         states, actions, n = flight.record.states, flight.record.actions, len(flight.record.actions)
