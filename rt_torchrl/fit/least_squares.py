@@ -459,6 +459,12 @@ def judged(likelihood: Likelihood) -> Judgement:
 
 def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
     """Correlation of the residuals of neighbouring samples that exist, for each sensor."""
+    products, squares = _sums(likelihood)
+    return products / squares
+
+
+def _sums(likelihood: Likelihood) -> tuple[Float[Tensor, " n_y"], Float[Tensor, " n_y"]]:
+    """Sums of the products of neighbouring residuals, in units of the noise, and of their squares."""
     products, squares = torch.zeros_like(likelihood.noise), torch.zeros_like(likelihood.noise)
     for block in likelihood.residuals():
         for values, seen in zip(block.values, block.group.seen, strict=True):
@@ -466,16 +472,17 @@ def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
                 r = values[seen[:, k], k]
                 products[k] += r[1:] @ r[:-1]
                 squares[k] += r @ r
-    return products / squares
+    return products, squares
 
 
 def not_white(likelihood: Likelihood) -> str:
     """What residuals that are no noise say of the standard errors; empty where neighbours are hardly alike."""
-    rms, scatter = judged(likelihood).rms, scatter_of(likelihood.sensors, likelihood.records)
-    rows = zip(likelihood.sensors, autocorrelation(likelihood).tolist(), rms.tolist(), scatter.tolist(), strict=True)
+    (products, squares), scatter = _sums(likelihood), scatter_of(likelihood.sensors, likelihood.records)
+    rms = likelihood.noise * (squares / likelihood.samples).sqrt()
+    columns = ((products / squares).tolist(), rms.tolist(), scatter.tolist())
     alike = ", ".join(
         f"{sensor.name} (correlation {value:.2g}, RMS {error:.2g} {sensor.measurement.unit})"
-        for sensor, value, error, size in rows
+        for sensor, value, error, size in zip(likelihood.sensors, *columns, strict=True)
         if value > ALIKE and error > ROUNDED * size
     )
     words = (

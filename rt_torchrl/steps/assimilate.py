@@ -96,26 +96,27 @@ class Assimilation:
             return self._descend_anew(whole)
         before, damping = copy.deepcopy(self.twin.closure.state_dict()), self.damping
         descended, config = self._fit(whole), self.config
-        noisy = self.estimates or (config.initial is None and self._noisy())
-        if noisy and not self.estimates and (config.method, config.inputs) == ESTIMABLE:
+        asks = config.initial is None and not self.estimates and self._errs()
+        if asks or self.estimates or self.twin.noise.any():
+            self._find_noise()
+        if asks and self.twin.noise.any() and (config.method, config.inputs) == ESTIMABLE:
             self._estimate_first_states(True)
             self.twin.closure.load_state_dict(before)
             self.damping = damping
             descended = self._fit(whole)
-        if noisy or self.twin.noise.any():
-            with contextlib.suppress(FloatingPointError):
-                self.twin.noise = noise_levels(self.twin, records)
+            self._find_noise()
         return descended
 
-    def _noisy(self) -> bool:
-        """Whether the sensors have noise, as the present twin tells; not asked where errors are tiny."""
+    def _errs(self) -> bool:
+        """Whether the errors of the present twin are more than tiny."""
         sensors, whole = self._problem.sensors, batch_of(self._records)
         scatter = scatter_of(sensors, sensor_records(self.twin.plant, sensors, whole))
-        if (self._rms(self.in_segments(whole)) <= SURE * EXPLAINED * scatter).all():
-            return False
+        return not (self._rms(self.in_segments(whole)) <= SURE * EXPLAINED * scatter).all()
+
+    def _find_noise(self) -> None:
+        """Give the twin the noise of the sensors that its records show; it keeps what it has where it diverges."""
         with contextlib.suppress(FloatingPointError):
-            return bool(noise_levels(self.twin, self._records).any())
-        return False
+            self.twin.noise = noise_levels(self.twin, self._records)
 
     def _fit(self, whole: Trajectory) -> Descended:
         """Descend over segments, or choose: whole records, or segments if the twin is unstable and leaves these."""
