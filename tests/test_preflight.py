@@ -191,6 +191,7 @@ MISTAKES = {
 
 
 QUICK = ("torque has the other sign", "degrees for radians", "all in degrees", "torque one interval late", "°C for K")
+QUICK += ("pitch from the other end",)  # whose right command is beyond the limits of the wrong one
 QUICK += tuple(name for name, (plant, *_) in MISTAKES.items() if plant in (ARM, LEVELS, REVERSED))
 
 

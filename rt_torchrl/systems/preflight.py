@@ -29,14 +29,14 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.options import OTHER_UNITS
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.sound_part import sound_part
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.trajectories.twin import Sensitivities
 
 STARTS, INTERVALS = 3, 40
 """Number of starts, and of control intervals after each."""
@@ -357,8 +357,10 @@ class _Fit:
     """
 
     def __init__(self, plant: Plant, closure: nn.Module):
+        require_end_cost(plant)
         self.plant, self._closure = plant, copy.deepcopy(closure).cpu()
-        self._twin = DigitalTwin(plant, self._closure)
+        # A twin takes recorded actions as they are; what a mistake made of a command goes through actuators.
+        self._sensitivities = Sensitivities(plant, self._closure)
         self._weights = [weight for weight in self._closure.parameters() if weight.requires_grad]
         self.guess = torch.cat([torch.zeros(0).double(), *(weight.detach().flatten() for weight in self._weights)])
 
@@ -417,7 +419,7 @@ class _Fit:
         held = (torch.arange(steps) / flown.ratio).long()
         inputs, actions = flown.exogenous[:, held], flown.actions[:, held]
         try:
-            ends, slopes = self._twin.sensitivities(flown.states, inputs, actions, start=flown.t)
+            ends, slopes = self._sensitivities(flown.states, inputs, actions, start=flown.t)
         except DivergenceError:
             nan = torch.full_like(flown.ends, torch.nan)
             return nan, nan[..., None].expand(-1, -1, len(weights))

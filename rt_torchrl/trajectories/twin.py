@@ -68,7 +68,7 @@ class DigitalTwin:
         self._engine = engine
         self.replay = Rollout(replaying(plant), closure, engine=engine)
         """Virtual episodes, or parts of them, under recorded actions as they are; see :meth:`Rollout.__call__`."""
-        self.sensitivities = Sensitivities(plant, closure)
+        self.sensitivities = Sensitivities(replaying(plant), closure)
         self._planned: list[_Planned] = []
         self._read: ReadInterval | None = None
         self._correction: Callable[[nn.Module], Tensor] | None = None
@@ -320,7 +320,7 @@ def _propagated(jacobians: Tensor, S: Tensor) -> Tensor:
 
 
 class Sensitivities:
-    """Trajectories under recorded actions with their sensitivities.
+    """Trajectories under given actions with their sensitivities.
 
     Args:
         plant: the physics.
@@ -328,7 +328,7 @@ class Sensitivities:
     """
 
     def __init__(self, plant: Plant, closure: nn.Module):
-        self.interval = Interval(replaying(plant), closure, None)
+        self.interval = Interval(plant, closure, None)
         self._tangent = TangentInterval(self.interval, self._trained())
         self._engine = Native()
 
@@ -341,7 +341,7 @@ class Sensitivities:
         Args:
             initial_state: initial state s_0 of each trajectory.
             exogenous: exogenous inputs z, held over each interval.
-            actions: actions as they were applied, held over each interval.
+            actions: commands, held over each interval; actions as they were applied if the plant is :func:`replaying`.
             start: time of s_0 [s], one for all trajectories or one for each.
             initial: append the n_s columns of ds_k/ds_0.
         """
