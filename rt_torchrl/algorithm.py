@@ -41,7 +41,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
-from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.belief import Belief, equal
 from rt_torchrl.steps.config import EXPERIENCE, Role, TwinningConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble
@@ -262,6 +262,25 @@ class ReinforcementTwinning(TensorDictSequential):
             self.virtual.processes.clear()
         start_cost = torch.stack([flight.cost for flight in flights]).mean()
         return merged(merged(episode, report), metrics(start_cost=start_cost))
+
+    def conclude(self) -> bool:
+        """After the last episode: a plan that no flight has tried does not stay if real episodes contradict the twin.
+
+        The live policy then gets those weights of the last that have flown that are expected to cost least.
+
+        Returns:
+            Whether the live policy has changed.
+        """
+        policy, plan = self.policies[self.referee.live], self.steps["plan"]
+        present = policy.state_dict()
+        if any(equal(flight.weights, present) for flight in self.belief.flown):
+            return False
+        if not self.belief.corrects or not self.belief.contradicted:
+            return False
+        best = self.belief.best_flown(policy, self.virtual.draw(plan.counts[1]))
+        if best is not None:
+            policy.load_state_dict(best[0])
+        return best is not None
 
     def _sound(self, step: Callable[[TensorDictBase], TensorDictBase], episode: TensorDictBase) -> TensorDictBase:
         """Take a step that relies on the twin; the one rollback of the algorithm.

@@ -66,7 +66,7 @@ def scripted(found, live, idle):
     """Make step 6 compare these costs."""
     acts = found.referee.live
     costs = {found.policies[acts]: live, found.policies[other_than(acts)]: idle}
-    found.belief.judge = lambda policy, episodes: Judged(costs[policy], costs[policy])
+    found.belief.judge = lambda policy, episodes: Judged(*3 * (costs[policy],))
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,11 @@ def test_a_clone_event_distils(live):
     judge, poor = found.belief.judge, found.policies[idle]
 
     def judged(policy, episodes):
-        return Judged(1e9, 1e9) if policy is poor and torch.equal(weights(poor), replaced) else judge(policy, episodes)
+        return (
+            Judged(1e9, 1e9, 1e9)
+            if policy is poor and torch.equal(weights(poor), replaced)
+            else judge(policy, episodes)
+        )
 
     found.belief.judge = judged
     report = flown(found, "switch", episode=episode)
@@ -220,7 +224,7 @@ def test_a_refused_clone_is_no_event_and_says_why():
     episode = flown(found, *STEPS[:-1])
     before = {role: weights(policy) for role, policy in found.policies.items()}
     costs = iter([1e-9, 2e-9, 2e-9, 1.0])  # of both policies, of that which is replaced, of its clone
-    found.belief.judge = lambda policy, episodes: Judged(cost := next(costs), cost)
+    found.belief.judge = lambda policy, episodes: Judged(*3 * (next(costs),))
     report = flown(found, "switch", episode=episode)
     assert report["event"] == "keep" and "clone refused" in report["reason"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
@@ -383,3 +387,23 @@ def test_a_fit_begins_anew_where_the_present_closure_diverges_and_the_first_one_
     report = flown(found, "assimilate", episode=TensorDict({"record": {"whole": torch.tensor(True)}, "live": "first"}))
     assert report["J_p_before"].isinf() and report["J_p"].isinf()
     assert all((weight == 1e3).all() for weight in found.twin.closure.parameters())
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_a_plan_that_no_flight_has_tried_does_not_stay_if_real_episodes_contradict_the_twin(right):
+    plant = LinearQuadratic(horizon=2.0)
+    closure = LinearClosure(plant.closure.matrix.detach() + (0.0 if right else 0.5))
+    referee = RefereeConfig(rule="expected_cost")
+    options = {"arm": "model_based", "referee": referee, "assimilation": AssimilationConfig(iterations=0)}
+    found = twinning(plant, closure=closure, **options)
+    for _ in range(3):
+        found.episode()
+    flown_weights = [flight.weights["gain"] for flight in found.belief.flown]
+    with torch.no_grad():
+        found.model_based.gain.add_(1.0)
+    untried = weights(found.model_based)
+    assert found.belief.contradicted == found.conclude() == (not right)
+    concluded = found.model_based.gain.detach().clone()
+    assert any(torch.equal(concluded, gain) for gain in flown_weights) == (not right)
+    assert torch.equal(weights(found.model_based), untried) == right
+    assert not found.conclude() and torch.equal(found.model_based.gain, concluded)

@@ -362,3 +362,35 @@ def test_the_best_that_flew_is_found_whatever_was_computed_before():
     assert judged == again and torch.equal(weights["gain"], same["gain"])
     policy = LinearGain(weights["gain"].tolist())
     assert warm.judge(policy, episodes).expected == pytest.approx(judged.expected, rel=1e-12)
+
+
+def test_what_refuted_weights_counts_also_where_extreme_episodes_diverge():
+    belief, refuted = belief_of([(0.5, 0.5)]), LinearGain([[0.5, 0.5]])
+    belief.virtual.judge = lambda policy, episodes: (math.inf, 1.0)
+    judged = belief.judge(refuted, virtual_episodes(LinearQuadratic()))
+    assert judged == (math.inf, belief.expected(refuted, 1.0), 1.0) and belief.expected(refuted, 1.0) > 1.1
+
+
+class Walled(LinearClosure):
+    """A law that makes no sense where only the real system goes."""
+
+    def __init__(self, matrix, wall):
+        super().__init__(matrix)
+        self.wall = wall
+
+    def forward(self, features):
+        return super().forward(features) / (features[..., :1].abs() < self.wall)
+
+
+def test_a_twin_that_diverges_within_an_interval_from_where_the_real_system_was_is_refused():
+    belief = belief_of([(0.5, 0.5)])
+    twin, (flight,) = belief.virtual.twin, belief.flown
+    episode = belief.virtual.repeated(flight.trajectory)
+    alone = twin.control(LinearGain([[0.5, 0.5]]), *episode).states[..., 0].abs().max().item()
+    real = flight.trajectory.states[:, 0].abs().max().item()
+    assert alone < real
+    belief.require_sound_twin(episode)
+    walled = DigitalTwin(twin.plant, Walled(twin.closure.matrix.detach(), 0.5 * (alone + real)))
+    belief = belief_of([(0.5, 0.5)], twin=walled)
+    with pytest.raises(DivergenceError, match="position is not finite"):
+        belief.require_sound_twin(episode)

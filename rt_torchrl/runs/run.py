@@ -236,6 +236,8 @@ class Run:
             if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
                 self.episodes = load_checkpoint(self.folder, self.algorithm)  # as the last whole episode has left it
             self._end_operation()
+            if self.algorithm.conclude():
+                bar.write("real episodes contradict the twin: the last plan, which no flight has tried, does not stay")
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}

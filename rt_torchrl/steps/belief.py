@@ -104,10 +104,12 @@ class Judged(NamedTuple):
 
     Attributes:
         expected: the cost that is expected on the real system, extreme episodes included.
-        on_twin: mean J_a on the twin, which decides where extreme episodes diverge anyway.
+        without_extremes: what decides where extreme episodes diverge anyway: the cost that is expected without them.
+        on_twin: mean J_a on the twin.
     """
 
     expected: float
+    without_extremes: float
     on_twin: float
 
 
@@ -330,7 +332,8 @@ class Belief:
     def judge(self, policy: nn.Module, episodes: Scenario) -> Judged:
         """What a policy costs, by its flights in virtual episodes and by the belief."""
         cost, on_twin = self.virtual.judge(policy, episodes)
-        return Judged(self.expected(policy, cost), on_twin)
+        expected = self.expected(policy, cost)
+        return Judged(expected, expected if math.isfinite(cost) else self.expected(policy, on_twin), on_twin)
 
     @torch.no_grad()
     def expected(self, policy: nn.Module, cost: float) -> float:
@@ -464,7 +467,8 @@ class Belief:
         """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
 
         A twin that says e⁵ times what the last real episode cost diverges, too, and so does one that says e⁵ times what
-        any of the latest real episodes cost of virtual ones: nothing that it says of a plan counts.
+        any of the latest real episodes cost of virtual ones, and one that diverges within an interval from where a real
+        episode has been: nothing that it says of a plan counts.
 
         Raises:
             DivergenceError: if it does.
@@ -479,6 +483,8 @@ class Belief:
                 f"plant {twin.plant.name!r} diverged on its twin, or cost there e⁵ times what real episodes did, with "
                 f"the weights that have just flown on the real system; the closure is {type(twin.closure).__name__}."
             )
+        if self.corrects:
+            self.anchors()
 
     def state_dict(self) -> dict[str, Any]:
         return {"flights": [f._asdict() | {"trajectory": f.trajectory._asdict()} for f in (*self.first, *self.flown)]}
@@ -527,7 +533,7 @@ def alarm(differences: Sequence[float]) -> str | None:
 
 def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether two states, of a twin or of a policy, are the same."""
-    (leaves, structure), (other_leaves, other_structure) = tree_flatten(state), tree_flatten(other)
+    (leaves, structure), (other_leaves, other_structure) = tree_flatten(dict(state)), tree_flatten(dict(other))
     return structure == other_structure and all(
         torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(leaves, other_leaves, strict=True)
     )
