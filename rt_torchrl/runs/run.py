@@ -236,7 +236,8 @@ class Run:
             if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
                 self.episodes = load_checkpoint(self.folder, self.algorithm)  # as the last whole episode has left it
             self._end_operation()
-            if self.algorithm.conclude():
+            recalled = self.algorithm.conclude()
+            if recalled:
                 bar.write("real episodes contradict the twin: the last plan, which no flight has tried, does not stay")
             bar.doing("judging on unseen episodes")
             began = time.perf_counter()
@@ -244,7 +245,8 @@ class Run:
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
             real = self._fly_the_real_system(bar)
-            metrics = self._results(gap, flights, judged, real, time.perf_counter() - began)
+            checks = {"engine_gap": gap, "recalled": recalled}
+            metrics = self._results(checks, flights, judged, real, time.perf_counter() - began)
             if self.config.figures:
                 bar.doing("drawing the figures")
                 dashboard.images(self._drawn(flights, judged), len(self.episodes))
@@ -335,7 +337,7 @@ class Run:
 
     def _results(
         self,
-        gap: float,
+        checks: dict[str, float],
         flights: dict[str, Trajectory],
         judged: dict[str, Judged],
         real: dict[str, Any] | None,
@@ -350,7 +352,7 @@ class Run:
             best, better = exact_optimum(self.unseen, self.make_policy), judged[summary["better"]].control_costs.mean()
             summary["reference"] = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients}
             summary["reference"]["better_over_reference"] = better.item() / best.cost
-        summary |= {"engine_gap": gap, "ended": self.ended}
+        summary |= {**checks, "ended": self.ended}
         total, seconds = time.perf_counter() - self.started, results.seconds_per_step(self.episodes)
         seconds["judge"] = judging
         summary["seconds"] = seconds | {"rest": total - sum(seconds.values()), "total": total}
