@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import math
 import multiprocessing
-from functools import partial
 
 import pytest
 import test_algorithm
@@ -253,17 +252,6 @@ def test_windows_that_go_on_need_a_plant_that_is_the_same_in_each():
     for plant in (Seasonal(**whole), Clocked(**whole), rt.StackedObservations(LinearQuadratic(**part), 2)):
         assert not module.answers_by_time(plant)
     assert module.answers_by_time(rt.StackedObservations(Clocked(**part), 2)) == ["step", "observe"]
-
-
-def test_what_cannot_operate_is_refused(tmp_path):
-    for make_env, continuous, message in (
-        (lambda: rt.PlantEnv(SHORT), False, "cannot be sent to a process of its own"),
-        (partial(rt.PlantEnv, SHORT), True, "continuous operation needs a RealSystem.*PlantEnv does not"),
-    ):
-        with pytest.raises(ValueError, match=message), operation(make_env, continuous=continuous):
-            pass
-    with pytest.raises(ValueError, match=r"asynchronous needs a function that makes the real system"):
-        small_run(tmp_path, plant=PLANT, parts={"env": machine()}, asynchronous=True)
 
 
 def test_the_first_controller_goes_on_while_policies_are_expected_to_cost_twice_as_much(monkeypatch):

@@ -12,11 +12,10 @@ import torch
 from seeds_and_numbers import seeded
 from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
-from torchrl.envs import GymWrapper
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, Reading, RealSystem, Trajectory
+from rt_torchrl import AssimilationConfig, DigitalTwin, Trajectory
 from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
-from rt_torchrl.envs.pendulum.real import angle_and_speed, gymnasium_pendulum
+from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
 from rt_torchrl.fit.log import checked
 from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
@@ -45,11 +44,6 @@ def somewhere(count, seed=0):
     """States over the whole range, also where the speed is stopped, and commands beyond the motor's."""
     share = 2.0 * torch.rand(count, 3, generator=seeded(seed), dtype=torch.float64) - 1.0
     return torch.stack([math.pi * share[:, 0], 8.0 * share[:, 1]], -1), 3.0 * share[:, 2:]
-
-
-def test_a_time_limit_below_the_horizon_is_refused_before_anything_flies():
-    with pytest.raises(ValueError, match=r"after 200 of the 300 .*horizon of at most 10 s.*max_episode_steps"):
-        RealSystem(GymWrapper(gymnasium.make("Pendulum-v1")), Pendulum(horizon=15.0), state=Reading(of=angle_and_speed))
 
 
 @pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (0.7, 1.3)])

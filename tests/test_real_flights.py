@@ -199,13 +199,6 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
     assert [*baselines] == ["mine", "PD"] and baselines["mine"]["J_a"]["mean"] == pytest.approx(mean, rel=1e-9)
 
 
-def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_path):
-    rig = machine()
-    with pytest.raises(ValueError, match=r"baselines \['cascade'\] .* on the real system: .* real_unseen"):
-        run_on(rig, tmp_path, baselines={"cascade": Asked})
-    assert not rig.flights
-
-
 def test_a_policy_that_was_never_trained_does_not_fly_when_flights_are_asked_for(tmp_path, capsys):
     """The model-free arm acts; without iterations its weights are still the random ones.
 

@@ -15,10 +15,9 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import Actuation, PlantEnv, Reading, RealController, RealSystem, Run, SafetyConfig, SafetyLayer
+from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem, SafetyConfig, SafetyLayer
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.adapters import CallingSimulator
 
 MILLIMETRES = torch.tensor([1e3, 1e3], dtype=torch.float64)
@@ -149,23 +148,6 @@ def test_a_reading_that_is_not_finite_is_refused():
 
 
 # What a run on a real system refuses, because only a plant in simulation can do it, and the other way round.
-
-
-@pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])
-def test_options_of_a_simulation_are_refused(options, tmp_path):
-    plant = LinearQuadratic(horizon=2.0)
-    with pytest.raises(ValueError, match="real system"):
-        Run(RunConfig(log_dir=tmp_path, **options), plant, env=connected(plant))
-
-
-@pytest.mark.parametrize("simulated", [True, False])
-def test_a_real_controller_is_refused_where_policies_are_judged_in_simulation(simulated, tmp_path):
-    plant = LinearQuadratic(horizon=2.0)
-    env = None if simulated else connected(plant, closure=plant.closure)
-    config = RunConfig(log_dir=tmp_path / "run")
-    with pytest.raises(ValueError, match=r"baselines \['machine'\] can only be flown on the real system"):
-        Run(config, plant, env=env, baselines={"machine": RealController})
-    assert not (tmp_path / "run").exists()
 
 
 # A simulator that calls its controller, as an environment: its course, its ends, its failures.

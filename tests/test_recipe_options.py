@@ -8,22 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_export_recipe import RECIPES, recipe
+from test_export_recipe import RECIPES
 
 from rt_torchrl import Plant, RunConfig, rk4_step
 from rt_torchrl.options import configuration, read_options
 from rt_torchrl.runs.command_line import from_command_line, load_recipe, main_of
 from rt_torchrl.runs.loaded_run import config_class_of
-
-
-def test_weights_of_another_task_are_refused():
-    made = recipe("wind_turbine")
-    weights = made.EngineeringCost(pitch_rate=0.1)
-    assert made.Config(task="engineering", engineering=weights).plant().cost == weights
-    with pytest.raises(ValueError, match="weights of the task engineering"):
-        made.Config(engineering=weights)
-    with pytest.raises(ValueError, match="device='nowhere' cannot be used on this machine .* use cpu"):
-        made.main(made.Config(device="nowhere"))
 
 
 def of_command_line(plant, *words):

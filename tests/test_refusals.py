@@ -1,5 +1,6 @@
 """Every argument that cannot be is refused in words, by ``data/refusals.txt``: its name, its value, what is allowed."""
 
+import dataclasses
 import importlib
 import math
 import tempfile
@@ -11,6 +12,7 @@ import study
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import double, seeded
+from small_runs import small_run
 from tensordict import TensorDict
 from test_classical import PD
 from test_hypotheses import Suspecting
@@ -24,7 +26,7 @@ from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
-from rt_torchrl.fit.log import Column, checked, read_log
+from rt_torchrl.fit.log import Column, SensorLog, checked, read_log
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.settings import module_of
 
@@ -35,8 +37,9 @@ MODULES = """
     envs.flapping_wing.disturbances envs.flapping_wing.plant envs.pendulum.plant envs.pendulum.real
     envs.wind_turbine.closures envs.wind_turbine.disturbances envs.wind_turbine.plant envs.wind_turbine.rosco
     envs.wind_turbine.rotor envs.wind_turbine.turbsim envs.wind_turbine.unknown fit.least_squares fit.log
-    plants.signal steps.assimilate steps.config steps.interact steps.hypotheses.ensemble steps.learn steps.losses
-    steps.plan systems.config systems.exploration systems.safety
+    fit.resampling plants.signal runs.metrics steps.assimilate steps.config steps.interact steps.hypotheses.ensemble
+    steps.learn steps.losses steps.memory steps.plan systems.config systems.exploration systems.operation
+    systems.safety
 """.split()
 """Modules of the library whose names expressions may use beside the public ones."""
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -76,6 +79,16 @@ TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,
 
 def log(table, *columns):
     return checked(read_log(text(table), LQ, [Column.parse(column) for column in columns]), LQ)
+
+
+REGULAR = SensorLog(
+    times=0.1 * np.arange(50), columns=dict.fromkeys(("position", "velocity", "force", "disturbance"), np.zeros(50))
+)
+
+
+def run(**options):
+    """A run on the oracle plant, in a folder that does not exist yet."""
+    return small_run(Path(tempfile.mkdtemp(), "run"), **options)
 
 
 def studied(**options):
@@ -144,7 +157,20 @@ class Names(dict):
 
 HERE = Names(globals())
 LAGGED = HERE["LAGGED"] = rt.LaggedActuator(LQ, "force", 0.4)
-READ_BY_THE_TABLE = TensorDict, WIND, LinearClosure, Suspecting, double, seeded, PD, LinearGain, nn, tanks, turbines
+READ_BY_THE_TABLE = (
+    dataclasses,
+    TensorDict,
+    WIND,
+    LinearClosure,
+    Suspecting,
+    double,
+    seeded,
+    PD,
+    LinearGain,
+    nn,
+    tanks,
+    turbines,
+)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.parts[0])

@@ -17,7 +17,6 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit import resampling
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation
 from rt_torchrl.fit.log import Column, SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import (
@@ -82,8 +81,6 @@ def test_columns_are_converted_by_their_units(tmp_path):
     read = read_log(tank_log, tank, [Column.parse("T=wall_temperature[°F]"), Column.parse("p=pressure[kPa]")])
     assert read.columns["wall_temperature"].tolist() == pytest.approx([233.15, 273.15], rel=1e-13)
     assert read.columns["pressure"].tolist() == pytest.approx([1500.0, 2000.0], rel=1e-13)
-    with pytest.raises(ValueError, match=r"column 'x_mm' of .* for signal 'position': unit 'kg' is none of m, cm, mm;"):
-        read_log(tmp_path / "log.csv", PLANT, [columns[0], Column.parse("x_mm=position[kg]")])
 
 
 @pytest.mark.parametrize("name, index", [("log.CSV", None), ("log.parquet", None), ("log.Parquet", "time")])
@@ -244,16 +241,6 @@ def test_a_periodic_state_is_interpolated_across_its_seam(counted):
     assert (np.abs(found) <= math.pi).all() and segment.exogenous.shape == (len(found) - 1, 0)
 
 
-@pytest.mark.parametrize("unit", [1e3, 1e9])
-def test_a_time_in_another_unit_is_refused_before_memory_is_taken(unit, monkeypatch):
-    """Milliseconds and nanoseconds taken for seconds; of the latter the grid alone would have 10¹² points."""
-    monkeypatch.setattr(resampling, "_segment", lambda *_: pytest.fail("memory is taken"))
-    step = f"{0.1 * unit:g}"
-    message = rf"'time' of the log has a median step of {re.escape(step)} s.*236 rows would become \d+ .*dt=0.1 s"
-    with pytest.raises(ValueError, match=message):
-        resample(signals(0.1 * unit * np.arange(236)), PLANT)
-
-
 TESTS = Path(__file__).parent
 
 
@@ -305,25 +292,6 @@ def test_no_sample_is_lost_by_the_rounding_of_unix_seconds():
     parts = resample(filled(log, plant), plant)
     record = logged_readings(log, plant, sensors_in(plant, log), parts.segments[0], parts.gap)
     assert np.flatnonzero(record.seen[:, 0]).tolist() == list(range(0, 400, 20)) and len(record.actions) == 399
-
-
-REGULAR = signals(0.1 * np.arange(50))
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda log, plant: resample(REGULAR, PLANT, shortest=99), "no part of 99"),
-        (lambda log, plant: resample(REGULAR.without(["velocity"]), PLANT), "holds no velocity"),
-        (lambda log, plant: hold_out(resample(REGULAR, PLANT).segments, PLANT.dt, 0.1), "judge by"),
-        (lambda log, plant: filled(log, plant, {"air": 3.0}), "guess air=3.0: .* wall"),
-        (lambda log, plant: sensors_in(plant, log, ["wall"]), r"sensors=\('wall',\): the log has no column wall"),
-        (lambda log, plant: sensors_in(plant, log.without(["air"])), r"sensors=\(\) of plant 'room'.* choose among"),
-    ],
-)
-def test_what_does_not_fit_a_log_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        change(log_of(Room(), ["air"]), Room())
 
 
 @pytest.fixture

@@ -136,11 +136,7 @@ def test_a_step_that_is_too_coarse_for_its_plant_is_a_warning_before_any_work(tm
         rt.Run(rt.RunConfig(log_dir=tmp_path), LinearQuadratic(dt=1.5, horizon=30.0))
 
 
-def test_an_unwritable_folder_and_a_plant_that_breaks_its_contract_are_refused(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="log_dir=.*cannot be made"):
-        small_run(tmp_path / "file" / "run")
-
+def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
     class Forgetful(LinearQuadratic):
         def observe(self, t, state, exogenous):
             return state.detach()
@@ -181,5 +177,3 @@ def test_parts_of_ones_own_take_the_places_of_the_default_ones(tmp_path):
     for ours, its in zip(own["episodes"], usual["episodes"], strict=True):
         for name in ("real_cost", "J_p", "J_a_model_based", "J_a_model_free", "td_error"):
             assert ours[name] == pytest.approx(its[name], rel=1e-9), name
-    with pytest.raises(ValueError, match="replay belongs to ActorCritic"):
-        run("both", learner=ActorCritic, replay=LongTermMemory)

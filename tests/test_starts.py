@@ -136,16 +136,6 @@ def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
         assert not (tmp_path / "new").exists()
 
 
-def test_what_does_not_exist_is_refused(tmp_path):
-    for name, message in (
-        ("contoller", r"start='contoller' is none of random, controller, mpc"),
-        ("log.csv", "there is no such run folder or log"),
-        (str(tmp_path), "is no run folder"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            training(tmp_path / "new", start=name)
-
-
 def log_of(path, horizon, gap=False):
     plant = LinearQuadratic(horizon=horizon, noise=0.1)
     log = recorded(plant, PD(plant, GAINS).act, torch.Generator().manual_seed(1))

@@ -26,7 +26,7 @@ from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
+from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
 
@@ -95,13 +95,6 @@ def test_state_feedback_acts_on_readings(kind):
     act = lambda k, t, s, z: controller.act(k * plant.dt, s[:, :2], z)  # noqa: E731
     states, *_ = stepped(plant, plant.closure, state, exogenous, act)
     torch.testing.assert_close(flown.states, states, rtol=1e-5, atol=1e-5)
-
-
-def test_a_twin_that_holds_what_no_sensor_reads_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"all that sensors read; let believed\(\)"):
-        rt.Run(rt.RunConfig(log_dir=tmp_path), real())
-    with pytest.raises(ValueError, match="no sensor reads resonant_force, rate_of_force, bias_of_position"):
-        RealSystem(rt.PlantEnv(BASE), real(), state=Reading(keys=("state",)))
 
 
 def test_a_twin_that_diverges_on_some_episodes_is_infinitely_wrong_there_alone():
