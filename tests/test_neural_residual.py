@@ -12,25 +12,21 @@ from test_trajectory import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, Plant, Rollout, check_plant
+import rt_torchrl as rt
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import EnsembleAssimilation, Fit
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 RANGES = {"position": (-3.0, 3.0), "velocity": (-3.0, 3.0)}
 FORCE = "unknown force"
 
 
 def pushed(base, **options):
-    return NeuralResidual(base, {"velocity": 4.0}, inputs=("position", "velocity"), ranges=RANGES, **options)
+    return rt.NeuralResidual(base, {"velocity": 4.0}, inputs=("position", "velocity"), ranges=RANGES, **options)
 
 
 class Exact(LinearQuadratic):
@@ -46,7 +42,7 @@ class Exact(LinearQuadratic):
 def stirred(closure, scale=0.5):
     """The closure with other weights in its network, whose last layer is zero at first."""
     generator = torch.Generator().manual_seed(2)
-    (network,) = (m for m in closure.modules() if isinstance(m, BoundedPerceptron))
+    (network,) = (m for m in closure.modules() if isinstance(m, rt.BoundedPerceptron))
     with torch.no_grad():
         for weight in network.parameters():
             weight.add_(scale * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
@@ -57,7 +53,7 @@ def test_the_residual_is_the_bounded_network_in_the_units_of_the_plant():
     class Sized(LinearQuadratic):
         state_sizes = (1.0, 0.5)
 
-    plant = NeuralResidual(Sized(), {"velocity": 3.0}, inputs=("force", "position"), ranges={"position": (0.0, 4.0)})
+    plant = rt.NeuralResidual(Sized(), {"velocity": 3.0}, inputs=("force", "position"), ranges={"position": (0.0, 4.0)})
     closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
     first, last = (closure.own.network[k] for k in (0, 2))
     state = torch.tensor([[1.0, 0.2], [9.0, -3.0]], dtype=torch.float64)
@@ -71,11 +67,11 @@ def test_the_residual_is_the_bounded_network_in_the_units_of_the_plant():
     torch.testing.assert_close(added, torch.cat([nothing, expected], -1))
 
 
-@pytest.mark.parametrize("base", [LinearQuadratic(), Exact(), LaggedActuator(LinearQuadratic(), "force", 0.4)])
+@pytest.mark.parametrize("base", [LinearQuadratic(), Exact(), rt.LaggedActuator(LinearQuadratic(), "force", 0.4)])
 def test_it_begins_as_the_plant_itself(base):
     plant = pushed(base)
     state, exogenous, command = flight(base)
-    flown = [Rollout(p, p.closure, engine="autograd")(state, exogenous, command).states for p in (plant, base)]
+    flown = [rt.Rollout(p, p.closure, engine="autograd")(state, exogenous, command).states for p in (plant, base)]
     assert torch.equal(*flown)
     assert plant.states == base.states and plant.unread == base.unread and plant.own_scheme == base.own_scheme
 
@@ -91,7 +87,7 @@ def test_a_plant_that_wraps_a_runge_kutta_step_takes_one_of_the_sum():
     closure = stirred(plant.make_closure(torch.Generator()))
     (state, exogenous, command), t = flight(plant), torch.zeros(1).double()
     arguments = t, state, command[:, 0], exogenous[:, 0], closure
-    torch.testing.assert_close(plant.advance(*arguments), Plant.advance(plant, *arguments), rtol=1e-14, atol=0.0)
+    torch.testing.assert_close(plant.advance(*arguments), rt.Plant.advance(plant, *arguments), rtol=1e-14, atol=0.0)
 
 
 def test_around_another_scheme_it_is_of_second_order():
@@ -100,7 +96,7 @@ def test_around_another_scheme_it_is_of_second_order():
         closure = stirred(plant.extended(LinearClosure(LinearQuadratic.true_closure)))
         state, (n, steps) = torch.tensor([[1.0, -0.5]], dtype=torch.float64), (1, plant.n_steps)
         held = torch.full((n, steps, 1), 0.3, dtype=torch.float64)
-        return Rollout(plant, closure, engine="autograd")(state, 0.0 * held, held).states[0, -1]
+        return rt.Rollout(plant, closure, engine="autograd")(state, 0.0 * held, held).states[0, -1]
 
     with torch.no_grad():
         reference = end(LinearQuadratic, 0.01)
@@ -109,8 +105,8 @@ def test_around_another_scheme_it_is_of_second_order():
 
 
 def test_an_angle_turns_without_a_jump():
-    plant = NeuralResidual(Pendulum(), {"angular_speed": 1.0}, inputs=("angle", "torque"))
-    check_plant(plant, steps=20, traced=False)
+    plant = rt.NeuralResidual(Pendulum(), {"angular_speed": 1.0}, inputs=("angle", "torque"))
+    rt.check_plant(plant, steps=20, traced=False)
     closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
     low, high = (torch.tensor([[sign * torch.pi, 1.0]], dtype=torch.float64) for sign in (-1.0, 1.0))
     action, nothing = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
@@ -125,9 +121,9 @@ def test_an_angle_turns_without_a_jump():
 class Suspecting(LinearQuadratic):
     def suspects(self):
         return {
-            "lags": LaggedActuator(self, "force", 0.2),
-            "late, twice": DelayedActuator(self, "force", 0.2),
-            "position sensor": BiasedSensor(self, "position", 0.0, scale=0.2),
+            "lags": rt.LaggedActuator(self, "force", 0.2),
+            "late, twice": rt.DelayedActuator(self, "force", 0.2),
+            "position sensor": rt.BiasedSensor(self, "position", 0.0, scale=0.2),
         }
 
     def further_suspects(self):
@@ -155,7 +151,7 @@ FORCES = {
     "dry friction, −0.8 tanh 5v": lambda x, v: -0.8 * torch.tanh(5.0 * v),
     "none": lambda x, v: 0.0 * x,
 }
-ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
+ASSIMILATION = rt.AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
 NAMES = ("lags", "late, twice", "position sensor")
 
 
@@ -165,13 +161,13 @@ def records(real, noise, count=3):
     for _ in range(count):
         state, exogenous = real.draw_initial_state(1, generator), torch.zeros(1, real.n_steps, 1, dtype=torch.float64)
         held = 4.0 * torch.rand(1, real.n_steps // 10, 1, generator=generator, dtype=torch.float64) - 2.0
-        flown = Rollout(real, real.closure)(state, exogenous, held.repeat_interleave(10, 1))
+        flown = rt.Rollout(real, real.closure)(state, exogenous, held.repeat_interleave(10, 1))
         drawn = torch.randn(flown.states[0].shape, generator=generator, dtype=torch.float64)
-        yield Trajectory(flown.states[0] + noise * drawn, flown.actions[0], exogenous[0])
+        yield rt.Trajectory(flown.states[0] + noise * drawn, flown.actions[0], exogenous[0])
 
 
 def learned(real, names, noise=0.0):
-    plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, which=names)
+    plant, config = Suspecting(horizon=real.horizon), rt.HypothesesConfig(call=0.0, which=names)
     twin = make_twin(plant, LinearClosure([[0.0, 0.0], [0.0, 0.0]]), config)
     assimilation = EnsembleAssimilation(twin, ASSIMILATION, config)
     assimilation.update(list(records(real, noise)))
@@ -202,7 +198,7 @@ def test_it_explains_a_force_that_no_other_hypothesis_explains():
 @pytest.mark.parametrize("force", FORCES)
 def test_a_plan_on_what_it_explains_is_the_optimum(force):
     real = Real(FORCES[force], horizon=10.0)
-    truth, episodes, unseen = DigitalTwin(real, real.closure), drawn(real, 40, seed=1), drawn(real, 200, seed=2)
+    truth, episodes, unseen = rt.DigitalTwin(real, real.closure), drawn(real, 40, seed=1), drawn(real, 200, seed=2)
     few, all_ = (learned(real, names)[0] for names in (NAMES, (*NAMES, FORCE)))
     twins = (truth, few.twins[ALONE], few, all_)
     optimum, alone, others, with_it = (truth.cost(planned(twin, episodes), *unseen).item() for twin in twins)
@@ -217,7 +213,7 @@ def test_a_fit_goes_on_as_without_a_resumption_where_the_last_weights_diverge():
     plant, fits = pushed(LinearQuadratic(horizon=5.0)), []
     for _ in range(2):
         closure = plant.extended(LinearClosure([[0.0, 0.0], [0.0, 0.0]]))
-        fits.append(Fit(DigitalTwin(plant, closure), ASSIMILATION, 25))
+        fits.append(Fit(rt.DigitalTwin(plant, closure), ASSIMILATION, 25))
     fits[0].update([record])
     fits[1].load_state_dict(copy.deepcopy(fits[0].state_dict()))
     for fit in fits:
@@ -290,7 +286,7 @@ class Corrected(nn.Module):
         super().__init__()
         self.law = law
         ranges = [(-3.0, 3.0)] * 2
-        self.correction = BoundedPerceptron(ranges, [1.0, 1.0], hidden=(), generator=seeded())
+        self.correction = rt.BoundedPerceptron(ranges, [1.0, 1.0], hidden=(), generator=seeded())
 
     def forward(self, features):
         return self.law(features) + self.correction(features)
@@ -300,9 +296,9 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
     plant, moved = LinearQuadratic(horizon=4.0, noise=0.0), []
     for prior in (0.01, 0.1, 1.0):
         twin, flown, exogenous = recorded(plant, batch=1)
-        twin = DigitalTwin(plant, Corrected(twin.closure.requires_grad_(False)))
+        twin = rt.DigitalTwin(plant, Corrected(twin.closure.requires_grad_(False)))
         start = parameters_to_vector(twin.closure.correction.parameters()).detach()
-        config = AssimilationConfig(prior=prior, inputs="record", method="levenberg_marquardt", iterations=40)
+        config = rt.AssimilationConfig(prior=prior, inputs="record", method="levenberg_marquardt", iterations=40)
         assimilation = Assimilation(twin, config)
         assimilation.update([flown.each()[0]])
         away = parameters_to_vector(twin.closure.correction.parameters()).detach() - start

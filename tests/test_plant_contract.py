@@ -15,7 +15,6 @@ from test_export_recipe import leave_run
 from torchrl.envs.utils import check_env_specs
 
 import rt_torchrl as rt
-from rt_torchrl import Rollout, check_plant, load_run
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing import unknown as drones
@@ -25,8 +24,6 @@ from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.runs.command_line import from_command_line
-from rt_torchrl.trajectories.trajectory import control_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 CLASSES = {"linear_quadratic": LinearQuadratic} | rt.shipped_plants()
 GREATEST_EPISODE = 200
@@ -101,7 +98,7 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
     episode, policy = fly(plant)
     assert episode["next", "truncated"].flatten().tolist() == [False] * (plant.n_steps - 1) + [True]
     assert not episode["next", "terminated"].any()
-    twin = DigitalTwin(plant, plant.closure)
+    twin = rt.DigitalTwin(plant, plant.closure)
     exogenous, states = episode["exogenous"], torch.cat([episode["state"], episode["next", "state"][:, -1:]], 1)
     scale = states.abs().amax((0, 1))
     with torch.no_grad():
@@ -114,7 +111,7 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
             # The same operations on other batch shapes: rounding, damped by stable plants.
             assert ((flown.states - states).abs() / scale).max() < 1e-12, name
             torch.testing.assert_close(flown.actions, episode["next", "applied"], rtol=1e-12, atol=1e-12)
-        cost = control_cost(plant, flights["policy"])
+        cost = rt.control_cost(plant, flights["policy"])
     torch.testing.assert_close(cost, -episode["next", "reward"][..., 0].mean(-1), rtol=1e-12, atol=0)
 
 
@@ -255,7 +252,7 @@ KNOWN = {
 
 
 def flown(plant, state, exogenous, command):
-    return Rollout(plant, plant.closure)(state, exogenous, command).states
+    return rt.Rollout(plant, plant.closure)(state, exogenous, command).states
 
 
 def systems_of(plant):
@@ -271,7 +268,7 @@ def test_every_system_fulfils_the_contract_and_reads_what_its_twin_knows(plant, 
     systems, make = KNOWN[plant]
     base = make()
     system = systems.unknown(base, (name,))
-    check_plant(system, steps=5, traced=False, trained=False)
+    rt.check_plant(system, steps=5, traced=False, trained=False)
     assert system.readings == base.states and system.name == plant
     assert set(systems.SYSTEMS[name]) <= set(systems.PARTS)
 
@@ -279,7 +276,7 @@ def test_every_system_fulfils_the_contract_and_reads_what_its_twin_knows(plant, 
 def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     base = WindTurbine(inertia=1e15, observe=("scheduled",))
     plant = LaggedInflow(base, 10.0)
-    check_plant(LaggedInflow(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
+    rt.check_plant(LaggedInflow(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
     read, n, wind = base.draw_initial_state(1, seeded()), 60, 13.0
     state, exogenous = plant.at_rest(read), torch.full((1, n, 1), wind, dtype=torch.float64)
     power = 1e6 * flown(plant, state, exogenous, read[:, None, 4:6].expand(1, n, 2))[0, :, -1]
@@ -311,7 +308,7 @@ def test_several_systems_combine_in_the_order_of_their_parts():
 
 def test_the_policies_of_an_unknown_system_are_made_for_what_the_twin_knows(tmp_path):
     config, parts = leave_run(tmp_path, "wind_turbine", policy="scheduled", unknown=("pitch",))
-    run = load_run(tmp_path)
+    run = rt.load_run(tmp_path)
     assert run.physics.states == run.plant.readings and run.plant.unread == 4
     assert type(run.closure) is type(config.believed().make_closure(torch.Generator()))
     assert torch.equal(run.policy("model_based").weights, parts["model_based"].weights)

@@ -10,11 +10,8 @@ from printed_commands import documented
 from seeds_and_numbers import seeded
 from test_algorithm import flown, twinning, weights
 
-from rt_torchrl import DigitalTwin, Planner, PlantEnv, ReinforcementTwinning, WholeEpisodes
-from rt_torchrl.steps.config import LearnerConfig, PlannerConfig, RefereeConfig
-from rt_torchrl.steps.learn import ActorCritic, Learner
+import rt_torchrl as rt
 from rt_torchrl.steps.losses import METHODS
-from rt_torchrl.steps.switch import DecisionTree, Referee
 
 pytestmark = pytest.mark.training
 
@@ -23,7 +20,7 @@ SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16}
 
 
 def actor_critic(algorithm, policy):
-    return ActorCritic(PLANT, policy, LearnerConfig(algorithm=algorithm, **SMALL), generator=seeded(1))
+    return rt.ActorCritic(PLANT, policy, rt.LearnerConfig(algorithm=algorithm, **SMALL), generator=seeded(1))
 
 
 LEARNERS = {
@@ -31,12 +28,12 @@ LEARNERS = {
     "documented": lambda policy: documented("learner.md", "RandomSearch")(policy, generator=seeded(1)),
 }
 PLANNERS = {
-    "whole episodes": lambda twin, policy: WholeEpisodes(twin, policy, PlannerConfig(iterations=2)),
+    "whole episodes": lambda twin, policy: rt.WholeEpisodes(twin, policy, rt.PlannerConfig(iterations=2)),
     "documented": lambda twin, policy: documented("planner.md", "Steps")(twin, policy),
 }
 REFEREES = {
-    "decision tree": lambda: DecisionTree(RefereeConfig(rule="decision_tree", patience=0)),
-    "expected cost": lambda: DecisionTree(RefereeConfig()),
+    "decision tree": lambda: rt.DecisionTree(rt.RefereeConfig(rule="decision_tree", patience=0)),
+    "expected cost": lambda: rt.DecisionTree(rt.RefereeConfig()),
     "documented": lambda: documented("referee.md", "ModelFirst")(),
 }
 
@@ -44,12 +41,12 @@ REFEREES = {
 def algorithm(**parts):
     """The algorithm with learner, planner or referee given as an argument: a function of twin and policies."""
     generator = seeded(2)
-    twin = DigitalTwin(PLANT, PLANT.make_closure(generator))
+    twin = rt.DigitalTwin(PLANT, PLANT.make_closure(generator))
     policies = {"model_free": PLANT.make_policy(generator), "model_based": PLANT.make_policy(generator)}
     given = {"learner": (policies["model_free"],), "planner": (twin, policies["model_based"]), "referee": ()}
     parts = {name: make(*given[name]) for name, make in parts.items()}
     config = twinning().config
-    return ReinforcementTwinning(PlantEnv(PLANT), twin, **policies, config=config, generator=generator, **parts)
+    return rt.ReinforcementTwinning(rt.PlantEnv(PLANT), twin, **policies, config=config, generator=generator, **parts)
 
 
 def saved(state):
@@ -66,7 +63,7 @@ UNLIKE = {name: LEARNERS[name] for name in ("ddpg", "sac", "crossq", "documented
 
 @pytest.mark.parametrize(
     "part, protocol, makers",
-    [("learner", Learner, UNLIKE), ("planner", Planner, PLANNERS), ("referee", Referee, REFEREES)],
+    [("learner", rt.Learner, UNLIKE), ("planner", rt.Planner, PLANNERS), ("referee", rt.Referee, REFEREES)],
 )
 def test_a_training_with_each_goes_on_from_its_state_as_if_never_interrupted(part, protocol, makers):
     """The result is the same to the bit; the other two parts are the default ones."""

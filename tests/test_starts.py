@@ -14,10 +14,7 @@ from test_export_recipe import recipe
 from test_hypotheses import ASSIMILATION as NEWTON
 from test_hypotheses import LAG, Suspecting
 
-from rt_torchrl import PlantEnv, Run, RunConfig, SaturatedMLP, Signal, Trajectory, TwinEnsemble, load_run
-from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.plants.actuators import LaggedActuator
-from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig, PlannerConfig
+import rt_torchrl as rt
 from rt_torchrl.steps.start import transitions_of
 from rt_torchrl.steps.switch import clones
 
@@ -29,12 +26,12 @@ recorded = record_log.recorded
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(
     SMALL,
-    assimilation=AssimilationConfig(iterations=20, inputs="record", method="lbfgs"),
-    planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0)),
+    assimilation=rt.AssimilationConfig(iterations=20, inputs="record", method="lbfgs"),
+    planner=rt.PlannerConfig(receding_horizon=rt.PredictiveConfig(horizon=1.0)),
 )
 
 
-class Config(RunConfig):
+class Config(rt.RunConfig):
     """The oracle plant."""
 
     def plant(self):
@@ -61,7 +58,7 @@ def live_of(folder):
 
 
 def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
-    run, known = training(tmp_path, start=str(earlier)), load_run(earlier)
+    run, known = training(tmp_path, start=str(earlier)), rt.load_run(earlier)
     found = run.algorithm
     assert not len(found.start()) and found.referee.live == live_of(earlier)
     assert all(clones(policy, known.policy(role)) for role, policy in found.policies.items())
@@ -69,13 +66,13 @@ def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
 
 
 def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path):
-    run, known = training(tmp_path, start=str(earlier), policy="mlp", hidden=(4,)), load_run(earlier)
+    run, known = training(tmp_path, start=str(earlier), policy="mlp", hidden=(4,)), rt.load_run(earlier)
     found, teacher = run.algorithm, known.policy(live_of(earlier))
     report = found.start()
     assert report["start_cost"] > 0.0 and report["start_error_model_free"] < 0.1
     seen = found.short_term[0]
     torch.testing.assert_close(seen.actions, teacher(seen.states[:-1]).clamp(-2.0, 2.0).detach())
-    assert all(isinstance(policy, SaturatedMLP) for policy in found.policies.values())
+    assert all(isinstance(policy, rt.SaturatedMLP) for policy in found.policies.values())
 
 
 def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
@@ -83,24 +80,24 @@ def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
     training(tmp_path / "half", start="controller", twinning=arm).train()
     found = training(tmp_path / "whole", start=str(tmp_path / "half")).algorithm
     found.start()
-    assert clones(found.policies["model_based"], load_run(tmp_path / "half").policy("model_free"))
+    assert clones(found.policies["model_based"], rt.load_run(tmp_path / "half").policy("model_free"))
 
 
 @pytest.fixture(scope="module")
 def believing(tmp_path_factory):
     """A run that believes a lag of the force, and options of runs that begin with it."""
     folder, known = tmp_path_factory.mktemp("believing") / "run", Suspecting(horizon=4.0)
-    config = HypothesesConfig(call=0.0, which=("lags",))
+    config = rt.HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
     options = {"episodes": 1, "unseen": 2, "figures": False, "twinning": twinning}
-    Run(small_runs.believing(known)(log_dir=folder, **options), LaggedActuator(known, "force", LAG)).train()
+    rt.Run(small_runs.believing(known)(log_dir=folder, **options), rt.LaggedActuator(known, "force", LAG)).train()
     return folder, options | {"start": str(folder)}
 
 
 def test_hypotheses_of_a_run_go_on(believing, tmp_path):
     folder, options = believing
-    found = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=4.0)).algorithm
-    its, ours = load_run(folder, RunConfig, plant=Suspecting(horizon=4.0)).twin, found.twin
+    found = rt.Run(rt.RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=4.0)).algorithm
+    its, ours = rt.load_run(folder, rt.RunConfig, plant=Suspecting(horizon=4.0)).twin, found.twin
     assert its.hypothesis == ours.hypothesis == "lags" and found.assimilation.called
     (its, ours) = (twin.twins["lags"].closure.state_dict() for twin in (its, ours))
     assert all(torch.equal(weight, its[name]) for name, weight in ours.items())
@@ -108,11 +105,11 @@ def test_hypotheses_of_a_run_go_on(believing, tmp_path):
 
 def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believing, tmp_path):
     options = believing[1] | {"log_dir": tmp_path}
-    which = [dataclasses.replace(SMALL, hypotheses=HypothesesConfig(which=(name,))) for name in ("late", "none")]
-    late, alone = (RunConfig(**options | {"twinning": twinning}) for twinning in which)
+    which = [dataclasses.replace(SMALL, hypotheses=rt.HypothesesConfig(which=(name,))) for name in ("late", "none")]
+    late, alone = (rt.RunConfig(**options | {"twinning": twinning}) for twinning in which)
     with pytest.raises(ValueError, match=r"believes 'lags', but hypotheses 'lags' .*which of that run, or none"):
-        Run(late, Suspecting(horizon=4.0))
-    assert not isinstance(Run(alone, Suspecting(horizon=4.0)).algorithm.twin, TwinEnsemble)
+        rt.Run(late, Suspecting(horizon=4.0))
+    assert not isinstance(rt.Run(alone, Suspecting(horizon=4.0)).algorithm.twin, rt.TwinEnsemble)
 
 
 class Cubic(LinearClosure):
@@ -123,7 +120,7 @@ class Cubic(LinearClosure):
 
 
 def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
-    speed = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
+    speed = (*LinearQuadratic.observations[:1], rt.Signal(symbol="v", name="speed", unit="-"))
     for changed, options, message in (
         ({"name": "other"}, {}, "whose name is linear_quadratic; here it is other"),
         ({"observations": speed}, {}, "whose observations is .*velocity_error"),
@@ -167,7 +164,7 @@ def test_a_run_from_a_log_is_resumed_without_the_log(tmp_path):
     path.unlink()
     both = training(tmp_path / "run", episodes=2, resume=True, **options).train()["episodes"]
     assert "start_cost" in first[0] and "start_cost" not in both[1] and len(both) == 2
-    assert load_run(tmp_path / "run").config.start == str(path)
+    assert rt.load_run(tmp_path / "run").config.start == str(path)
 
 
 class Falling(LinearQuadratic):
@@ -195,10 +192,10 @@ class Ending(LinearQuadratic):
 @pytest.mark.parametrize("plant", [Ending(horizon=2.0), test_early_ends.Falling()])
 def test_transitions_of_a_record_are_those_of_a_flight(plant):
     """Its end, at the horizon or early, is that of an episode; a part of it has no such end."""
-    env = PlantEnv(plant, seed=0)
+    env = rt.PlantEnv(plant, seed=0)
     episode = env.rollout(plant.n_steps)[0]
     states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-    record = Trajectory(states, episode["next", "applied"], episode["exogenous"])
+    record = rt.Trajectory(states, episode["next", "applied"], episode["exogenous"])
     found = transitions_of(plant, record)
     assert (len(episode) < plant.n_steps) == bool(episode["next", "terminated"].any()) == (plant.end_cost is not None)
     ends = [("next", key) for key in ("observation", "reward", "done", "terminated", "truncated")]

@@ -11,31 +11,23 @@ from small_runs import SMALL, small_run
 from test_algorithm import flown as after
 from test_algorithm import twinning
 
-from rt_torchrl import (
-    ClassicalController,
-    ExplorationConfig,
-    OperatingLimits,
-    PlantEnv,
-    RunConfig,
-    SafetyLayer,
-    Trajectory,
-)
+import rt_torchrl as rt
 from rt_torchrl.runs.real_side import simulated
-from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.switch import other_than
-from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 
-LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
+LIMITS = rt.OperatingLimitsConfig(
+    states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0}
+)
 
 
-WIDE = OperatingLimitsConfig(states={"velocity": (-50.0, 50.0)}, rates={"force": 39.0})
+WIDE = rt.OperatingLimitsConfig(states={"velocity": (-50.0, 50.0)}, rates={"force": 39.0})
 
 
 def limited(limits=LIMITS, **options):
     plant = LinearQuadratic(horizon=2.0)
-    options = {"referee": RefereeConfig(rule="decision_tree")} | options  # which keeps every update
-    config = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
-    layer = SafetyLayer(PlantEnv(plant, seed=0), config, fallback=(0.0,))
+    options = {"referee": rt.RefereeConfig(rule="decision_tree")} | options  # which keeps every update
+    config = rt.SafetyConfig(interval=plant.dt, **rt.OperatingLimits(plant, limits).safety())
+    layer = rt.SafetyLayer(rt.PlantEnv(plant, seed=0), config, fallback=(0.0,))
     return twinning(plant, env=layer, limits=limits, **options)
 
 
@@ -43,7 +35,7 @@ def test_what_leaves_a_limit_is_found_by_hand():
     plant = LinearQuadratic(horizon=0.4)
     states = torch.tensor([[0.0, 9.0], [0.0, 3.0], [9.0, -3.1], [0.0, 0.0], [0.0, math.nan]]).double()
     actions = torch.tensor([[1.0], [0.5], [-0.1], [1.1]]).double()
-    found = OperatingLimits(plant, LIMITS).broken(Trajectory(states, actions, torch.zeros(4, 1).double()))
+    found = rt.OperatingLimits(plant, LIMITS).broken(rt.Trajectory(states, actions, torch.zeros(4, 1).double()))
     # The first state is nobody's fault, NaN lies between no limits, and steps of 0.5 are 5 N/s.
     assert found["states"].tolist() == [False, True, False, True]
     assert found["actions"].tolist() == [False, False, False, True]
@@ -112,8 +104,8 @@ def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
 @pytest.mark.parametrize("limits", [{}, {"actions": {"force": (-0.3, 0.3)}}, {"rates": {"force": 2.0}}])
 def test_a_perfect_twin_flies_again_what_the_layer_sent(limits, tmp_path):
     fixed = dataclasses.replace(SMALL.assimilation, iterations=0)
-    exploration = ExplorationConfig(spread=0.5, episodes=9)
-    options = {"limits": OperatingLimitsConfig(**limits), "assimilation": fixed, "exploration": exploration}
+    exploration = rt.ExplorationConfig(spread=0.5, episodes=9)
+    options = {"limits": rt.OperatingLimitsConfig(**limits), "assimilation": fixed, "exploration": exploration}
     run = small_run(tmp_path, episodes=2, twinning=dataclasses.replace(SMALL, **options))
     run.algorithm.twin.closure.load_state_dict(LinearQuadratic().closure.state_dict())
     for record in run.train()["episodes"]:
@@ -123,7 +115,7 @@ def test_a_perfect_twin_flies_again_what_the_layer_sent(limits, tmp_path):
     assert (actions.abs().max() > 0.3 + 1e-9) == ("actions" not in limits)
 
 
-class Lagged(ClassicalController):
+class Lagged(rt.ClassicalController):
     """a = −2 m, where m follows the velocity."""
 
     memory_size = 1
@@ -135,8 +127,8 @@ class Lagged(ClassicalController):
 
 def test_the_memory_of_the_fallback_goes_on_while_the_policy_acts():
     """At the second trip the former controller knows what it would know had it watched all the time."""
-    limits = OperatingLimitsConfig(states={"velocity": (-0.7, 0.7)})
-    config = RunConfig(twinning=dataclasses.replace(SMALL, limits=limits), seed=3)
+    limits = rt.OperatingLimitsConfig(states={"velocity": (-0.7, 0.7)})
+    config = rt.RunConfig(twinning=dataclasses.replace(SMALL, limits=limits), seed=3)
     plant = LinearQuadratic(horizon=4.0)
     env = simulated(plant, config, Lagged, device=torch.device("cpu"))
     row, memory, fallback, acted = env.reset(), 0.0, [], {}

@@ -17,25 +17,21 @@ from test_extensions import flight
 from test_real_system import Rig, connected
 
 import rt_torchrl as rt
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import Answer
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.fit.log import SensorLog
 from rt_torchrl.fit.resampling import resample
-from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.real_system import episode_seed
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
 
 BASE = LinearQuadratic(horizon=2.0)
 
 
 def real(base=BASE):
     """A slow actuator, and a sensor that is off."""
-    return rt.BiasedSensor(ResonantActuator(base, "force", 3.0, 0.4), "position", 0.2, scale=0.1)
+    return rt.BiasedSensor(rt.ResonantActuator(base, "force", 3.0, 0.4), "position", 0.2, scale=0.1)
 
 
 class Config(rt.RunConfig):
@@ -55,10 +51,10 @@ def test_a_run_judges_on_the_true_system_and_keeps_its_hidden_states_hidden(tmp_
     assert run.algorithm.short_term[-1].states.shape[-1] == 2
     assert (tmp_path / "figures" / "states.png").exists()
     policy, unseen = run.algorithm.policies["model_based"], run.unseen
-    true = control_cost(real(), Rollout(real(), real().closure, policy)(unseen.initial_state, unseen.exogenous))
+    true = rt.control_cost(real(), rt.Rollout(real(), real().closure, policy)(unseen.initial_state, unseen.exogenous))
     assert found["unseen"]["J_a_model_based"]["mean"] == pytest.approx(true.mean().item(), rel=1e-9)
     flown = PD(BASE).fly(unseen.initial_state, unseen.exogenous, plant=unseen.plant)
-    costs = control_cost(unseen.plant, flown).tolist()
+    costs = rt.control_cost(unseen.plant, flown).tolist()
     assert found["unseen"]["costs"]["PD"] == pytest.approx(costs, rel=1e-9)
     loaded = rt.load_run(tmp_path, Config)
     assert loaded.physics.states == loaded.plant.readings == BASE.states
@@ -70,23 +66,23 @@ def test_a_twin_is_judged_by_what_sensors_read():
     unseen = UnseenEpisodes(real(), 3)
     flown = unseen.fly(LinearGain([[0.3, 0.3]]))
     read = flown.states[..., :2]
-    rollout = Rollout(BASE, BASE.closure)
+    rollout = rt.Rollout(BASE, BASE.closure)
     replayed = rollout(read[:, 0], flown.exogenous, flown.actions)
-    expected = identification_cost(BASE, replayed, read)
+    expected = rt.identification_cost(BASE, replayed, read)
     torch.testing.assert_close(unseen.identification_costs(BASE, BASE.closure, flown), expected)
     costs = []
     for half in (flown.part(0, 10, BASE.dt), flown.part(10, 20, BASE.dt)):
         read = half.states[..., :2]
-        costs.append(identification_cost(BASE, rollout(read[:, 0], half.exogenous, half.actions), read))
+        costs.append(rt.identification_cost(BASE, rollout(read[:, 0], half.exogenous, half.actions), read))
     found = unseen.identification_costs(BASE, BASE.closure, flown, segment=10)
     torch.testing.assert_close(found, 0.5 * (costs[0] + costs[1]))
-    assert unseen.judge(flown).control_costs.tolist() == pytest.approx(control_cost(real(), flown).tolist())
+    assert unseen.judge(flown).control_costs.tolist() == pytest.approx(rt.control_cost(real(), flown).tolist())
 
 
 @pytest.mark.parametrize("kind", ["classical", "predictive"])
 def test_state_feedback_acts_on_readings(kind):
     plant = real()
-    planned = PredictiveControl(BASE, BASE.closure, PredictiveConfig(horizon=0.5))
+    planned = rt.PredictiveControl(BASE, BASE.closure, rt.PredictiveConfig(horizon=0.5))
     controller = PD(BASE) if kind == "classical" else planned
     state, exogenous = drawn(plant, 2, 1)
     flown = controller.fly(state, exogenous, plant=plant)
@@ -149,12 +145,12 @@ def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(
     extend, base, engine = EXTENSIONS[kind], Timed(), "native"
     plain = extend(base)
     start, exogenous, commands = flight(plain, 12, 3)
-    flown = Rollout(plain, plain.closure, engine=engine)(start, exogenous, commands)
+    flown = rt.Rollout(plain, plain.closure, engine=engine)(start, exogenous, commands)
     expected = by_hand(observed(plain, flown.states, exogenous), 3)
     for plant in (rt.StackedObservations(plain, 3), extend(rt.StackedObservations(base, 3))):
         assert plant.unread == plain.unread and len(plant.observations) == 8
         stacked = plant.draw_initial_state(3, seeded(3))
-        found = Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
+        found = rt.Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
         torch.testing.assert_close(observed(plant, found.states, exogenous), expected, rtol=1e-13, atol=1e-13)
         costs = [
             p.running_cost(torch.zeros(1), x.states[:, :-1], commands, exogenous)
@@ -191,7 +187,7 @@ def test_the_controller_in_c_holds_the_past_observations(tmp_path):
 def test_past_observations_follow_from_a_log():
     plant = rt.StackedObservations(Timed(), 3)
     start, exogenous, commands = flight(plant, 12)
-    states = Rollout(plant, plant.closure)(start, exogenous, commands).states[0].detach()
+    states = rt.Rollout(plant, plant.closure)(start, exogenous, commands).states[0].detach()
     log = {signal.name: states[:, k] for k, signal in enumerate(LinearQuadratic.states)}
     found = plant.complete_states(log, exogenous[0], commands[0])
     torch.testing.assert_close(found[1:], states[1:], rtol=1e-14, atol=1e-14)
@@ -246,7 +242,7 @@ def test_past_observations_are_what_sensors_read_then():
         clean = rt.PlantEnv(plant, seed=4).rollout(10)["observation"]
         assert ((seen - clean).abs()[..., :1] > 1e-3).any()
         policy = plant.make_policy(seeded())
-        actor = LivePolicy(plant, policy, ExplorationConfig(), generator=seeded(5))
+        actor = LivePolicy(plant, policy, rt.ExplorationConfig(), generator=seeded(5))
         actor.begin(policy, strength=0.0)
         envs = [rt.PlantEnv(plant, noise=noise, seed=4) for _ in range(2)]
         collectors = FlightCollector(envs[0], actor), EpisodeCollector(envs[1], actor, plant)
