@@ -1,7 +1,6 @@
 """Identification from a log: derivatives against backpropagation, fits against regression, recipes around logs."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
-RECIPES = Path(__file__).parent.parent / "recipes"
 record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
 

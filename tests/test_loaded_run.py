@@ -17,7 +17,6 @@ from test_hypotheses import Suspecting
 
 from rt_torchrl import HypothesesConfig, RunConfig, SaturatedMLP, load_run
 from rt_torchrl.runs import settings as settings_module
-from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.switch import clones
@@ -46,22 +45,6 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
         found = run.closure if role == "closure" else run.policy(role)
         assert clones(found, part)
     assert isinstance(run.policy("model_free"), SaturatedMLP) >= (policy == "mlp")
-
-
-CHOICES = {
-    "wind_turbine": {"observe": ("preview", "speed_rate"), "task": "engineering", "horizon": 10.0},
-    "cryogenic_tank": {"observe": ("measured+load",), "command": "duty", "end_weight": 7200.0, "horizon": 3000.0},
-}
-
-
-@pytest.mark.parametrize("plant", CHOICES)
-def test_a_run_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path):
-    config, _ = leave_run(tmp_path, plant, **CHOICES[plant])
-    run, usual = load_run(tmp_path), type(config)().plant()
-    assert run.config == config and run.plant.cost == config.plant().cost != usual.cost
-    assert run.plant.observations == config.plant().observations != usual.observations
-    with pytest.raises(ValueError, match="observe is"):
-        load_recipe(RECIPES / f"{plant}.py").main(dataclasses.replace(config, observe=("paper",), resume=True))
 
 
 ROOM = """

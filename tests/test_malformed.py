@@ -95,10 +95,7 @@ def read_config(path):
 READERS = {
     "log.csv": (write_log, read_sensor_log),
     "log.parquet": (write_log, read_sensor_log),
-    "wind.hh": (
-        lambda path: path.write_text(WIND),
-        read_wind_file,
-    ),
+    "wind.hh": (lambda path: path.write_text(WIND), read_wind_file),
     "wind.bts": (lambda path: path.write_bytes(bts_bytes(plane()[1])[0]), read_wind_file),
     "table.csv": (partial(shutil.copy, DATA / "nrel5mw_Cp_table_rosco.csv"), read_table),
     "weights.pt": (lambda path: save_tensors(path, weights()), read_weights),

@@ -24,24 +24,16 @@ IDS = [f"{name}-{which}" for name, _, which in CHOICES]
 RICHEST = {(name, list(kind.observation_sets)[-1]) for name, kind in PLANTS.items() if kind.observation_sets}
 
 
-def short(kind, **options):
-    plant = kind(**options)
-    return kind(dt=plant.dt, horizon=50 * plant.dt, **options)
-
-
-def names(plant):
-    return [signal.name for signal in plant.observations]
-
-
 @pytest.mark.parametrize(
     ("name", "kind", "which"),
     [pytest.param(*c, marks=() if (c[0], c[2]) in RICHEST else pytest.mark.slow) for c in CHOICES],
     ids=IDS,
 )
 def test_a_plant_fulfils_its_contract_with_every_set(name, kind, which):
-    plant = short(kind, observe=(which,))
+    dt = kind().dt
+    plant = kind(dt=dt, horizon=50 * dt, observe=(which,))
     rt.check_plant(plant, episodes=2, steps=10, traced=False)
-    assert names(plant) == list(kind.observation_sets[which])
+    assert [signal.name for signal in plant.observations] == list(kind.observation_sets[which])
 
 
 @pytest.mark.parametrize(("name", "kind", "which"), CHOICES, ids=IDS)
@@ -128,25 +120,24 @@ def test_virtual_episodes_preview_their_own_wind():
 
 
 SENSORS = {
-    "wind_turbine": ("rotor_speed",),
-    "flapping_wing": ("forward_position", "height"),
-    "cryogenic_tank": ("pressure",),
+    "wind_turbine": (("rotor_speed",), ()),
+    "flapping_wing": (("forward_position", "height"), ("--observe", "position+wind")),
+    "cryogenic_tank": (("pressure",), ()),
 }
-"""The sensors that are there, beside those of the inputs."""
-SEEN = {"wind_turbine": (), "flapping_wing": ("--observe", "position+wind"), "cryogenic_tank": ()}
-"""Options with which the policies observe nothing but these sensors and what a controller computes from them."""
+"""Sensors that are there, beside those of the inputs, and options by which policies observe nothing else."""
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_policies_of_some_sensors_see_nothing_else(name):
     """No change of another state, which no controller holds, changes the observation."""
-    config = from_command_line(load_recipe(RECIPES / f"{name}.py").Config, SEEN[name])
+    sensors, options = SENSORS[name]
+    config = from_command_line(load_recipe(RECIPES / f"{name}.py").Config, options)
     plant, time = config.plant(), torch.zeros(1).double()
     state, exogenous = drawn(plant)
     exogenous = exogenous[:, 0]
     seen = plant.observe(time, state, exogenous)
     for k, signal in enumerate(plant.states):
-        if signal.name not in (*SENSORS[name], *plant.controller_states):
+        if signal.name not in (*sensors, *plant.controller_states):
             moved = state.clone()
             moved[:, k] += 0.01
             assert torch.equal(plant.observe(time, moved, exogenous), seen), signal.name

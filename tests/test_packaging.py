@@ -24,12 +24,6 @@ RECIPES = {path.stem for path in (ROOT / "recipes").glob("*.py")}
 MISSING = [name for name in ("build", "hatchling") if importlib.util.find_spec(name) is None]
 
 
-def python(code, *words, cwd=ROOT, **options):
-    """What a piece of code does in a process of its own."""
-    command = [sys.executable, "-c", code, *words]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, **options)
-
-
 def test_no_file_imports_the_folder_by_its_own_name():
     """``import envs.x`` would make a second class of every plant."""
     for path in [p for folder in ("rt_torchrl", "envs", "tests", "recipes") for p in (ROOT / folder).rglob("*.py")]:
@@ -150,7 +144,7 @@ def test_the_help_of_a_recipe_waits_for_pytorch_alone():
         "        'torchrl', 'torchdiffeq', 'onnx', 'jax')\n"
         "print([name for name in late if name in sys.modules])"
     )
-    done = python(code, *LATE)
+    done = subprocess.run([sys.executable, "-c", code, *LATE], cwd=ROOT, capture_output=True, text=True)
     helped = [line for line in done.stdout.splitlines() if line.startswith("usage: ")]
     assert (len(helped), done.stdout.splitlines()[-1]) == (len(LATE), "[]"), done.stdout + done.stderr
 

@@ -24,6 +24,7 @@ from rt_torchrl.options import read_options
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import RunFolder, load_tensors, save_tensors
 from rt_torchrl.runs.settings import BESIDE, read_settings
+from rt_torchrl.steps.belief import equal
 from rt_torchrl.steps.learn import ActorCritic
 from rt_torchrl.steps.plan import MultiStart
 
@@ -97,16 +98,6 @@ CONTENT = {
 }
 
 
-def same(one, other):
-    if isinstance(one, torch.Tensor):
-        return one.dtype == other.dtype and torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return type(one) is type(other) and all(map(same, one, other)) and len(one) == len(other)
-    return one == other
-
-
 def test_what_is_saved_is_read_back(tmp_path):
     """Also by torch alone; weights and numbers of other kinds become plain ones."""
     file, module = tmp_path / "weights.pt", nn.Linear(2, 3)
@@ -114,10 +105,10 @@ def test_what_is_saved_is_read_back(tmp_path):
     save_tensors(file, CONTENT | others)
     expected = CONTENT | {"module": dict(module.state_dict()), "number": 0.1, "size": (2,)}
     for found in (load_tensors(file), torch.load(file, weights_only=True)):
-        assert same(found, expected) and type(found["module"]) is dict and type(found["number"]) is float
+        assert equal(found, expected) and type(found["module"]) is dict and type(found["number"]) is float
     with pytest.raises(ValueError, match=r"\['real_system'\]\['rng'\]\[1\] of what is to be saved is a ndarray"):
         save_tensors(file, {"real_system": {"rng": [0, np.zeros(2)]}})
-    assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"] and same(load_tensors(file), expected)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"] and equal(load_tensors(file), expected)
 
 
 class Bomb:
@@ -149,7 +140,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
         patched.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
         with pytest.raises(OSError, match="No space left on device; what was there before is intact.*checkpoint.pt"):
             save_tensors(file, {"other": 1})
-    assert same(load_tensors(file), CONTENT)
+    assert equal(load_tensors(file), CONTENT)
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 

@@ -381,13 +381,6 @@ def grid(lam, beta) -> torch.Tensor:
     return torch.tensor(np.stack(pairs, axis=-1))
 
 
-def test_optimum_at_fine_pitch(table):
-    # The published figures have three digits, and C_p is flat there: within 2.1e-4 of its top from λ = 7.5 to 7.8.
-    power, lam = table.optimum()
-    assert power == pytest.approx(0.466, abs=5e-4)
-    assert lam == pytest.approx(7.64, abs=0.02)
-
-
 @pytest.mark.parametrize("make", [PowerCoefficientTable.nrel5mw, uneven])
 def test_agrees_with_fitpack_between_nodes(make):
     table = make()
@@ -436,27 +429,3 @@ def test_overspeed_brakes(table):
     assert (power.diff(dim=0) < 0).all()
     assert (power[-1] < 0).all()
     assert torch.isfinite(power).all()
-
-
-def test_with_jonkmans_constants_it_flies_as_his_controller():
-    plant = WindTurbine(observe=("scheduled",))
-    state, wind = plant.draw_initial_state(4, seeded(5)), plant.draw_exogenous(4, seeded(5))
-    policy = nominal(plant)
-    policy.reference_speed, policy.switch_speed = JonkmanController.reference_speed, 120.0
-    flown = Rollout(plant, plant.closure, policy)(state, wind)
-    power, expected = (
-        plant.merit(f.states, f.actions, wind)["mean power [MW]"]
-        for f in (flown, JonkmanController(plant).fly(state, wind))
-    )
-    # The blend and the incremental integral differ from his table and his integrator.
-    torch.testing.assert_close(power, expected, rtol=0.015, atol=0.0)
-
-
-def test_a_steady_wind_above_rated_is_held_at_rated_speed(controller):
-    plant = controller.plant
-    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
-    flown = controller.fly(state, torch.full((1, 600, 1), 16.0, dtype=torch.float64))
-    # The integral leaves no error; 300 s are eighteen time constants of the rotor.
-    assert plant.gear_ratio * flown.states[0, -1, 0].item() == pytest.approx(controller.reference_speed, rel=1e-3)
-    power = plant.generator_power(flown.states[:, -2], flown.actions[:, -1]).item()
-    assert power == pytest.approx(controller.power, rel=1e-3)
