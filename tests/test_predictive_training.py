@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from small_runs import FULL, SMALL
+from small_runs import FULL, SMALL, small_run
 from test_export_recipe import recipe
 
-from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, Run, RunConfig, load_run
+from rt_torchrl import AssimilationConfig, PlannerConfig, PredictiveConfig, PredictiveControl, RunConfig, load_run
 from rt_torchrl.steps.switch import clones
 
 pytestmark = pytest.mark.training
@@ -24,11 +24,9 @@ class Config(RunConfig):
         return LinearQuadratic(horizon=2.0, noise=0.5)
 
 
-def training(folder=None, episodes=3, *, twinning=None, **options):
+def training(folder, episodes, *, twinning=None, **options):
     chosen = dataclasses.replace(SMALL, **({"planner": PLANNER, "assimilation": FIT} | (twinning or {})))
-    options = {"figures": False, "unseen": 2} | options
-    config = Config(episodes=episodes, log_dir=folder, twinning=chosen, **options)
-    return Run(config, config.plant())
+    return small_run(folder, episodes, Config().plant(), config=Config, unseen=2, twinning=chosen, **options)
 
 
 @pytest.mark.parametrize("rule", ["decision_tree", "expected_cost"])

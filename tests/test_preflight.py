@@ -1,13 +1,12 @@
 """The check of a real system's wiring: mistakes on four systems, all of them named, and none where none is."""
 
-import dataclasses
 import math
 import re
 
 import pytest
 import torch
 from faulty_system import as_reported
-from small_runs import SMALL
+from small_runs import small_run
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 
@@ -270,21 +269,20 @@ def test_the_sequence_of_episodes_goes_on_as_if_nothing_had_been_flown():
 
 def test_a_training_refuses_a_wrong_wiring_after_its_first_flight_and_before_it_learns(tmp_path):
     system = wired(PENDULUM, sent=(-1.0, 0.0))
-    config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
-    run = rt.Run(config, PENDULUM, env=system)
+    run = small_run(tmp_path, 1, PENDULUM, parts={"env": system})
     before = parameters_to_vector(run.algorithm.twin.closure.parameters())
     with pytest.raises(rt.WiringError, match="action torque is negated"):
         run.train()
     assert torch.equal(parameters_to_vector(run.algorithm.twin.closure.parameters()), before)
     assert not len(run.algorithm.learner.memory) and system.state_dict()["episodes"] == 1
-    unchecked = dataclasses.replace(config, preflight=False, log_dir=tmp_path / "unchecked")
-    assert len(rt.Run(unchecked, PENDULUM, env=system).train()["episodes"]) == 1
+    unchecked = small_run(tmp_path / "unchecked", 1, PENDULUM, parts={"env": system}, preflight=False)
+    assert len(unchecked.train()["episodes"]) == 1
 
 
 def test_the_results_say_what_the_first_flight_left_unexplained(tmp_path):
-    config = rt.RunConfig(log_dir=tmp_path, episodes=1, unseen=2, figures=False, twinning=SMALL)
+    run = small_run(tmp_path, 1, PENDULUM, parts={"env": wired(PENDULUM, real=Shaken(horizon=5.0))})
     with pytest.warns(UserWarning, match=r"leaves .*[2-9]\d\.\d % of angular_speed unexplained, which is no"):
-        metrics = rt.Run(config, PENDULUM, env=wired(PENDULUM, real=Shaken(horizon=5.0))).train()
+        metrics = run.train()
     (doubt,) = metrics["episodes"][0]["doubts"]
     for note in ("neighbouring residuals of angle (0.9) are alike", ""):  # without one the residuals are noise
         metrics["summary"]["twin"]["note"] = note

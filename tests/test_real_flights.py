@@ -11,13 +11,13 @@ from faulty_system import as_reported
 from figure_reading import draw
 from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import stepped
-from small_runs import FULL, IDLE
+from small_runs import FULL, IDLE, small_run
 from test_algorithm import flown, twinning
 from test_classical import PD
 from test_early_ends import STRONG, WEAK, Falling
 from test_real_system import Rig, connected
 
-from rt_torchrl import PlantEnv, Run, RunConfig, SafetyConfig, SafetyLayer, load_run
+from rt_torchrl import PlantEnv, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 from rt_torchrl.runs.real_side import entries
 
@@ -54,11 +54,10 @@ class Machine(Rig):
 
 
 def run_on(machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=FULL, **options):
-    own = {"episodes": 2, "unseen": 3, "figures": False}
-    config = RunConfig(log_dir=folder, twinning=twinning, **own | options)
     plant = machine.inner.plant
-    given = {"baselines": baselines, "first": first, "callbacks": callbacks}
-    return Run(config, plant, env=connected(plant, rig=machine, closure=closure), **given)
+    system = connected(plant, rig=machine, closure=closure)
+    parts = {"env": system, "baselines": baselines, "first": first, "callbacks": callbacks}
+    return small_run(folder, 2, plant, parts=parts, twinning=twinning, **options)
 
 
 def costs_by_hand(plant, closure, episodes, act):

@@ -156,14 +156,11 @@ def test_numbers_that_json_does_not_have_are_null(tmp_path):
 # Checkpoints: what they hold, what a damaged one does, and a run that has none yet.
 
 
-QUICK = {"figures": False}
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A run of two episodes."""
     path = tmp_path_factory.mktemp("run")
-    small_run(path, episodes=2, **QUICK).train()
+    small_run(path, episodes=2).train()
     return path
 
 
@@ -171,7 +168,7 @@ PARTS = {"learner": "learn", "short_term": "interact", "virtual": "inputs", "ref
 
 
 def test_a_checkpoint_without_a_part_or_of_another_format_does_not_fit(folder, tmp_path):
-    algorithm, file = small_run(tmp_path / "run", **QUICK).algorithm, tmp_path / "checkpoint-0002.pt"
+    algorithm, file = small_run(tmp_path / "run").algorithm, tmp_path / "checkpoint-0002.pt"
 
     def refused(changed, message):
         save_tensors(file, changed)
@@ -196,14 +193,14 @@ def test_a_run_without_an_episode_starts_again_or_is_resumed_from_its_beginning(
         patched.setattr(MultiStart, "forward", killed)
         for _ in range(2):  # the same command again, although the first has written the options
             with pytest.raises(SystemExit, match="interrupted before the first episode was done"):
-                small_run(tmp_path, episodes=1, **QUICK).train()
-    resumed = small_run(tmp_path, episodes=1, resume=True, **QUICK).train()
-    whole = small_run(tmp_path / "whole", episodes=1, **QUICK).train()
+                small_run(tmp_path, episodes=1).train()
+    resumed = small_run(tmp_path, episodes=1, resume=True).train()
+    whole = small_run(tmp_path / "whole", episodes=1).train()
     for record in (*resumed["episodes"], *whole["episodes"]):
         record["seconds"] = None
     assert resumed["episodes"] == whole["episodes"]
     with pytest.raises(ValueError, match="holds a run already; --resume it, or choose another folder"):
-        small_run(tmp_path, episodes=1, **QUICK)
+        small_run(tmp_path, episodes=1)
 
 
 # Ctrl-C: at any moment of a training nothing is lost but the episode under way.
@@ -230,7 +227,7 @@ def test_a_first_press_waits_for_a_safe_point_and_a_second_does_not():
 
 def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
     """Step 2 iterates without an end here, and TorchRL has swapped weights for most of its time."""
-    small = small_run(tmp_path, episodes=2, **QUICK)
+    small = small_run(tmp_path, episodes=2)
     run_one, update = small.algorithm.episode, ActorCritic.update
 
     def endless(self):

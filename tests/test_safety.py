@@ -187,17 +187,6 @@ def test_specs_hold_around_both_kinds_of_systems():
     check_env_specs(layer(GymEnv("Pendulum-v1"), rates=(10.0,)))
 
 
-def test_what_the_layer_does_not_have_is_the_systems():
-    env = layer()
-    assert isinstance(env.plant, LinearQuadratic) and env.closure is env.plant.closure
-    state = env.state_dict()
-    first = env.reset()["state"]
-    env.load_state_dict(state)
-    assert torch.equal(env.reset()["state"], first)
-    with pytest.raises(AttributeError, match="nonsense"):
-        _ = env.nonsense
-
-
 def test_the_report_of_a_layer_within_a_transformed_environment_is_that_layers_own():
     """A transformed environment passes names on to what it transforms, whose own ``env`` is the system in the layer."""
     guarded = failing(broken=[1])

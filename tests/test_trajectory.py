@@ -238,15 +238,29 @@ class Solved(LinearQuadratic):
         return torch.linalg.solve(M, (M @ rates.unsqueeze(-1)).squeeze(-1))
 
 
+class Stiffness(nn.Module):
+    """p = (0, c s_1) with one number c, of no dimension."""
+
+    def __init__(self):
+        super().__init__()
+        self.c = nn.Parameter(torch.tensor(-0.2, dtype=torch.float64))
+
+    def forward(self, features):
+        return torch.stack([torch.zeros_like(features[..., 0]), self.c * features[..., 0]], -1)
+
+
 @pytest.mark.parametrize("native", [True, False])
-def test_rates_may_solve_linear_equations(native, monkeypatch):
+@pytest.mark.parametrize(("kind", "number"), [(Solved, False), (LinearQuadratic, True)])
+def test_rates_may_solve_linear_equations_and_a_weight_may_have_no_dimension(kind, number, native, monkeypatch):
     """With gradients off, PyTorch mixes the rows in batched Jacobians of a solution."""
     twin, flown, exogenous = recorded(LinearQuadratic(horizon=1.0))
-    solved = DigitalTwin(Solved(horizon=1.0), twin.closure)
+    twin.closure.load_state_dict({"matrix": torch.tensor([[0.0, 0.0], [-0.2, 0.0]]).double()})
+    own = DigitalTwin(kind(horizon=1.0), Stiffness() if number else twin.closure)
     if not native:
-        monkeypatch.setattr(solved.sensitivities._engine, "native_end_states", lambda *given: None)
+        monkeypatch.setattr(own.sensitivities._engine, "native_end_states", lambda *given: None)
     given = flown.states[:, 0], exogenous, flown.actions
-    for found, expected in zip(solved.sensitivities(*given), twin.sensitivities(*given), strict=True):
+    states, whole = twin.sensitivities(*given)  # by the four numbers of the matrix, of which the third is c
+    for found, expected in zip(own.sensitivities(*given), (states, whole[..., 2:3] if number else whole), strict=True):
         torch.testing.assert_close(found, expected)
 
 
@@ -340,27 +354,3 @@ def test_equals_torchdiffeq():
         state = rk4_step(forced_pendulum, t, state, 0.1)
         # The same formula; only the rounding of t + h/3 and of the sums differs, over at most 20 steps.
         torch.testing.assert_close(state, reference, rtol=1e-13, atol=1e-14)
-
-
-class Stiffness(nn.Module):
-    """p = (0, c s_1) with one number c, of no dimension."""
-
-    def __init__(self):
-        super().__init__()
-        self.c = nn.Parameter(torch.tensor(-0.2, dtype=torch.float64))
-
-    def forward(self, features):
-        return torch.stack([torch.zeros_like(features[..., 0]), self.c * features[..., 0]], -1)
-
-
-@pytest.mark.parametrize("native", [True, False])
-def test_a_weight_may_be_a_number_without_a_dimension(native, monkeypatch):
-    plant = LinearQuadratic(horizon=1.0)
-    twin, flown, exogenous = recorded(plant)
-    given = flown.states[:, 0], exogenous, flown.actions
-    own = DigitalTwin(plant, Stiffness())
-    twin.closure.load_state_dict({"matrix": torch.tensor([[0.0, 0.0], [-0.2, 0.0]]).double()})
-    if not native:
-        monkeypatch.setattr(own.sensitivities._engine, "native_end_states", lambda *given: None)
-    _, whole = twin.sensitivities(*given)  # by the four numbers of the matrix, of which the third is c
-    torch.testing.assert_close(own.sensitivities(*given)[1], whole[..., 2:3])
