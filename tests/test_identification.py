@@ -261,12 +261,3 @@ def test_a_prior_holds_perceptrons_at_their_first_values_whatever_short_segments
         and found.likelihood.prior.cost().item() == pytest.approx(5.0 * moved, rel=1e-9)
         and moved > 1e-6
     )
-
-
-def test_results_of_a_training_or_an_identification_are_not_overwritten(tmp_path):
-    config = recipe("identify").Config(log=tmp_path / "log.csv", plant="wind_turbine", log_dir=tmp_path)
-    for name in ("weights.pt", "metrics.json"):
-        (tmp_path / name).write_text("kept")
-        with pytest.raises(ValueError, match=rf"log_dir={tmp_path} holds results already.*{name}.*another folder"):
-            config.make_folder("wind_turbine")
-        assert (tmp_path / name).read_text() == "kept" and not (tmp_path / "figures").exists()

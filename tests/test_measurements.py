@@ -12,7 +12,6 @@ from test_export_recipe import RECIPES
 import rt_torchrl as rt
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.sensors import known_sensors, read, read_slopes
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -71,21 +70,6 @@ def test_a_filter_of_the_position_tells_the_speed_behind_it():
     torch.testing.assert_close(plant.seen_velocity(states[-1:])[0], -seen[2:4])
     start = plant.controller_start(double(0.3, 1.2, 0.0, 0.0), torch.zeros(1).double())
     assert start.tolist() == [0.3, 1.2]
-
-
-@pytest.mark.parametrize("name, kind, which", CHOICES, ids=IDS)
-def test_slopes_of_all_sensors_are_those_of_finite_differences(name, kind, which):
-    plant = kind(observe=(which,))
-    sensors, t = tuple(known_sensors(plant).values()), double(0.0, 1.0).expand(3, 2)
-    state = torch.stack([plant.draw_initial_state(3, seeded(k)) for k in range(2)], 1)
-    inputs = plant.draw_exogenous(3, seeded())[:, :2]
-    slopes = read_slopes(sensors, plant, t, state, inputs)
-    for k in range(len(plant.states)):
-        step = torch.zeros_like(state)
-        step[..., k] = 1e-6 * (1e-3 + state[..., k].abs().max())
-        ahead, behind = (read(sensors, plant, t, state + sign * step, inputs) for sign in (1.0, -1.0))
-        difference = (ahead - behind) / (2.0 * step[..., k, None])
-        torch.testing.assert_close(slopes[..., k], difference, rtol=1e-4, atol=1e-5)
 
 
 # Previews
@@ -163,9 +147,6 @@ def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way()
     turned = 2.0 * math.pi - 6.0
     expected = 0.5 * ((4.0 / 2.0) ** 2 + (turned / 0.5) ** 2)
     assert Turning().discrepancy(one, other).tolist() == pytest.approx([expected], rel=1e-12)
-    Turning.states = Turning.states[:1]
-    with pytest.raises(ValueError, match=r"discrepancy_scales=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
-        Turning().discrepancy(one[:, :1], other[:, :1])
 
 
 class Clocked(LinearQuadratic):

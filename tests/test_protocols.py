@@ -103,13 +103,3 @@ def test_planners_improve_their_policy_on_what_they_are_given(name):
     before, plan, after = cost(), found.planner.plan(episodes), cost()
     assert plan.start == pytest.approx(before, rel=1e-12) and plan.best == pytest.approx(after, rel=1e-12)
     assert after < before and plan.gradient > 0 and plan.iterations >= 1
-
-
-def test_a_learner_of_another_policy_and_the_state_of_another_training_are_refused():
-    other = PLANT.make_policy(seeded(5))
-    with pytest.raises(ValueError, match="ActorCritic trains another policy than model_free"):
-        algorithm(learner=lambda policy: LEARNERS["ddpg"](other))
-    with pytest.raises(ValueError, match="WholeEpisodes trains another policy than model_based"):
-        algorithm(planner=lambda twin, policy: PLANNERS["whole episodes"](twin, other))
-    with pytest.raises(ValueError, match="the saved state of learner does not fit"):
-        algorithm().load_state_dict(algorithm(learner=LEARNERS["td3"]).state_dict())

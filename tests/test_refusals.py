@@ -1,5 +1,7 @@
 """Every argument that cannot be is refused in words, by ``data/refusals.txt``: its name, its value, what is allowed."""
 
+# ruff: noqa: F401  (expressions of the table read the names)
+
 import dataclasses
 import importlib
 import math
@@ -16,8 +18,9 @@ from small_runs import small_run
 from tensordict import TensorDict
 from test_classical import PD
 from test_hypotheses import Suspecting
+from test_protocols import LEARNERS, PLANNERS, algorithm
 from test_real_system import WIND, Rig, connected
-from test_study import TINY
+from test_study import TINY, leave
 from torch import nn
 from traced_function import sections
 
@@ -91,6 +94,12 @@ def run(**options):
     return small_run(Path(tempfile.mkdtemp(), "run"), **options)
 
 
+def pair(**options):
+    """A finished run, and another one with these options."""
+    usual = {"seed": 0, "costs": [1.0, 2.0]}
+    return [leave(Path(tempfile.mkdtemp(), "run"), **usual | one) for one in ({}, options)]
+
+
 def studied(**options):
     usual = {"systems": (f"tiny={TINY}",), "arms": ("twinning",), "log_dir": Path(tempfile.mkdtemp())}
     study.studied(study.Config(**usual | options))
@@ -157,20 +166,6 @@ class Names(dict):
 
 HERE = Names(globals())
 LAGGED = HERE["LAGGED"] = rt.LaggedActuator(LQ, "force", 0.4)
-READ_BY_THE_TABLE = (
-    dataclasses,
-    TensorDict,
-    WIND,
-    LinearClosure,
-    Suspecting,
-    double,
-    seeded,
-    PD,
-    LinearGain,
-    nn,
-    tanks,
-    turbines,
-)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.parts[0])

@@ -139,8 +139,6 @@ def test_bad_rows_become_gaps_on_demand():
     assert np.allclose(parts.gaps, [(2.9, 3.4), (5.9, 6.1)])
     # The longest pause that is bridged is of rows that were never there.
     assert [len(segment.actions) for segment in resample(log, PLANT, gap=9.0).segments] == [29, 25, 38]
-    with pytest.raises(ValueError, match=r"or a row that was left out \(2 such places\)"):
-        resample(log, PLANT, shortest=50)
 
 
 def test_cuts_stay_where_a_log_is_cut_again():

@@ -86,6 +86,7 @@ PARTS = dataclasses.replace(
     planner=PlannerConfig(iterations=2),
     learner=dataclasses.replace(FULL.learner, algorithm="td3"),
     referee=RefereeConfig(clone_patience=0),
+    limits=rt.OperatingLimitsConfig(states={"velocity": (-50.0, 50.0)}, rates={"force": 39.0}),
 )
 """All parts of the method that the paper does not have."""
 DEARER = 1.25
@@ -125,6 +126,7 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
     assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.turns["late"].pause > 1
     assert resumed.algorithm.belief.flown
+    assert ["predicted_violations" in record for record in found["episodes"]] == [False, True, True]
     assert_same(found, resumed.train())
     learned = whole.algorithm.policies["model_free"].parameters()
     assert not any(torch.equal(*pair) for pair in zip(started, learned, strict=True))

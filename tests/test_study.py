@@ -135,22 +135,6 @@ def test_runs_that_differ_in_the_seed_are_one_row(tmp_path):
         assert "level outside [%]" in heading and sorted(row.split("|")[3].strip() for row in (one, two)) == ["", "3"]
 
 
-def test_runs_that_cannot_be_compared_are_refused(tmp_path):
-    first = leave(tmp_path / "a", seed=0, costs=[1.0, 2.0])
-    for options, message in (
-        ({"plant": "drone"}, r"differ in their plant \(tanks, drone\)"),
-        ({"costs": [1.0] * 3}, r"differ in their number of unseen episodes \(2, 3\)"),
-        ({"task": "engineering"}, r"differ in their task"),
-        ({}, "have the same seed and the same options"),
-    ):
-        other = leave(tmp_path / message[-9:], **{"seed": 0, "costs": [1.0, 2.0]} | options)
-        with pytest.raises(ValueError, match=message):
-            compare_runs([first, other])
-    (first / "metrics.json").unlink()
-    with pytest.raises(ValueError, match="has no metrics.json: it is not finished"):
-        compare_runs([first])
-
-
 def test_costs_on_different_twins_are_not_compared(tmp_path):
     folders = [leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 2.0]) for seed in (0, 1)]
     found = {"episodes": 2, "J_a": {"mean": 5.0}, "merit": {"power [W]": {"mean": 8.0}}}

@@ -28,12 +28,19 @@ def position():
 WINDS = (1.0, -2.0)
 
 
+def record_of(values, wind=0.0):
+    return sensor_record(Line(), position(), line_segment(values, wind=wind))
+
+
+def estimated(*records, closure=None, config=None):
+    """The fit of the line to records of its position."""
+    twin = DigitalTwin(Line(), closure or Slope())
+    return Estimation(twin, position(), config=config or EstimationConfig()).run(records)
+
+
 def line_estimate():
-    records = [
-        sensor_record(Line(), position(), line_segment((0.5 + 0.3 * z) * TIMES + NOISE * noise_of(81, k), wind=z))
-        for k, z in enumerate(WINDS)
-    ]
-    return Estimation(DigitalTwin(Line(), Slope()), position()).run(records)
+    slopes = [0.5 + 0.3 * z for z in WINDS]
+    return estimated(*(record_of(slopes[k] * TIMES + NOISE * noise_of(81, k), z) for k, z in enumerate(WINDS)))
 
 
 def exact_covariance():
@@ -109,14 +116,13 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
     """Calm air tells nothing of the second slope; one wind tells a sum of both, of which neither is known."""
     slope_error = NOISE * math.sqrt(1.0 / ((TIMES - TIMES.mean()) ** 2).sum())
     for wind, known in ((0.0, slope_error), (2.0, math.inf)):
-        segment = line_segment((0.5 + 0.3 * wind) * TIMES + NOISE * noise_of(81, 0), wind=wind)
-        records, closure = [sensor_record(Line(), position(), segment)], InUnits(weights, values)
-        estimate = Estimation(DigitalTwin(Line(), closure), position()).run(records)
+        x = (0.5 + 0.3 * wind) * TIMES + NOISE * noise_of(81, 0)
+        estimate = estimated(record_of(x, wind), closure=InUnits(weights, values))
         found = estimate.uncertainty
         assert (estimate.after["wind"] == estimate.before["wind"]) == (wind == 0.0)  # it keeps its first value
         errors = [error * unit for error, unit in zip(found.standard_errors().values(), values, strict=True)]
         # In the smallest units no step arrives; the error holds the rest of the way to the line of regression.
-        slope = np.polyfit(TIMES, segment.states[:, 0].numpy(), 1)[0] - wind * 0.3
+        slope = np.polyfit(TIMES, x, 1)[0] - wind * 0.3
         left = estimate.after["calm"] * values[0] - slope if wind == 0.0 else 0.0
         assert errors == pytest.approx([math.hypot(known, left), math.inf], rel=1e-6)
         (warning,) = (text for text in found.warnings() if "hardly" not in text)
@@ -140,8 +146,7 @@ class Fixed(Slope):
 
 
 def test_a_coefficient_that_is_fixed_has_no_error():
-    records = [sensor_record(Line(), position(), line_segment(1.1 * TIMES + NOISE * noise_of(81, 0), wind=2.0))]
-    uncertainty = Estimation(DigitalTwin(Line(), Fixed()), position()).run(records).uncertainty
+    uncertainty = estimated(record_of(1.1 * TIMES + NOISE * noise_of(81, 0), 2.0), closure=Fixed()).uncertainty
     slope_error = NOISE * math.sqrt(1.0 / ((TIMES - TIMES.mean()) ** 2).sum())
     assert uncertainty.standard_errors() == pytest.approx({"calm": slope_error, "wind": 0.0})
     assert not uncertainty.warnings()
@@ -154,9 +159,8 @@ def test_standard_errors_are_those_of_regression_with_correlated_noise():
     omega = 0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1))
     inverse = np.linalg.inv(X.T @ X)
     for seed in range(10):
-        segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=True))
-        record = sensor_record(Line(), position(), segment)
-        estimate = Estimation(DigitalTwin(Line(), Slope()), position(), config=ROBUST).run([record])
+        record = record_of(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=True))
+        estimate = estimated(record, config=ROBUST)
         found.append(estimate.uncertainty.named_covariance[0, 0].item())
     expected = math.sqrt((inverse @ X.T @ omega @ X @ inverse)[1, 1])
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
@@ -167,8 +171,7 @@ def test_standard_errors_are_those_of_regression_with_correlated_noise():
 @pytest.mark.parametrize("size", [0.05, 1e-6])
 def test_alike_residuals_are_told_with_their_size_beyond_rounding(size):
     wave = size * np.sin(2.0 * np.pi * TIMES / 2.0)
-    record = sensor_record(Line(), position(), line_segment(0.5 * TIMES + wave))
-    notes = " ".join(Estimation(DigitalTwin(Line(), Slope()), position()).run([record]).warnings())
+    notes = " ".join(estimated(record_of(0.5 * TIMES + wave)).warnings())
     found = re.search(r"position \(correlation (0.9\d), RMS (\S+) m\) are alike", notes)
     assert (found is not None) == (size > 1e-3)
     assert found is None or float(found[2]) == pytest.approx(size / math.sqrt(2.0), rel=0.1)
@@ -180,10 +183,7 @@ def test_standard_errors_hold_noise_that_drives_the_system():
     omega = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     root = np.linalg.cholesky(omega)
     for seed in range(40):
-        segment = line_segment(0.5 * 0.1 * np.arange(n) + root @ noise_of(n, seed))
-        estimate = Estimation(DigitalTwin(Line(), Slope()), position(), config=ROBUST).run(
-            [sensor_record(Line(), position(), segment)]
-        )
+        estimate = estimated(record_of(0.5 * 0.1 * np.arange(n) + root @ noise_of(n, seed)), config=ROBUST)
         z.append((estimate.after["w[0]"] - 0.5) / estimate.uncertainty.standard_errors()["w[0]"])
     # Newey and West without ρ give 2.1.
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
@@ -194,9 +194,8 @@ def test_a_simulation_starts_where_its_first_samples_say():
     with torch.no_grad():
         closure.w.copy_(found.likelihood.twin.closure.w)
     values = 3.0 + (0.5 + 0.3 * 1.5) * TIMES + NOISE * noise_of(81, 7)
-    record = sensor_record(Line(), position(), line_segment(values, wind=1.5))
     task = Estimation(DigitalTwin(Line(), closure), position())
-    readings = recipe("cascaded_tanks").simulated(task, found, record, first=20)
+    readings = recipe("cascaded_tanks").simulated(task, found, record_of(values, 1.5), first=20)
     w = found.likelihood.twin.closure.w.detach().numpy()
     slope = w[0] + 1.5 * w[1]
     start = np.mean(values[:20] - slope * TIMES[:20])
