@@ -21,7 +21,6 @@ from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
 record_log = recipe("record_log")
-policy_law, recorded = record_log.policy_law, record_log.recorded
 
 ROBUST = EstimationConfig(errors="robust")
 
@@ -29,7 +28,7 @@ ROBUST = EstimationConfig(errors="robust")
 def test_the_oracle_plant_is_identified_from_a_log_with_jitter_a_gap_and_noise():
     plant, generator = LinearQuadratic(dt=0.05, horizon=15.0, noise=0.5), torch.Generator().manual_seed(3)
     policy = plant.make_policy(generator)
-    log = recorded(plant, policy_law(plant, policy), generator, jitter=0.4, noise=0.005)
+    log = record_log.recorded(plant, record_log.policy_law(plant, policy), generator, jitter=0.4, noise=0.005)
     log = log.chosen((log.times < 5.0) | (log.times > 5.7))
     parts = resample(log, plant)
     sensors = sensors_in(plant, log)

@@ -22,7 +22,6 @@ from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.switch import clones
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
-WITHOUT_NEURAL_CLOSURE = ("pendulum",)
 
 
 def combinations():
@@ -32,7 +31,7 @@ def combinations():
         hints = typing.get_type_hints(kind)
         (closure, *closures), policies = typing.get_args(hints["closure"]), typing.get_args(hints["policy"])
         yield from ((plant, closure, policy) for policy in policies)
-        for further in closures if plant not in WITHOUT_NEURAL_CLOSURE else ():
+        for further in closures if plant != "pendulum" else ():  # which has no neural closure
             yield plant, further, policies[0]
 
 

@@ -130,9 +130,6 @@ def test_policies_of_some_sensors_see_nothing_else(name):
 # What a newcomer writes for a plant of their own, and what exploration adds to its policy.
 
 
-PLANT = LinearQuadratic(horizon=2.0)
-
-
 class Turning(LinearQuadratic):
     name = "turning"
     states = (

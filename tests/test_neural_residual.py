@@ -239,9 +239,9 @@ FEATURES = {
 }
 
 
-def points(plant, count=200):
+def points(plant):
     low, high = torch.tensor(FEATURES[plant.name], dtype=torch.float64).unbind(-1)
-    return low + (high - low) * torch.rand(count, len(low), generator=seeded(1), dtype=torch.float64)
+    return low + (high - low) * torch.rand(200, len(low), generator=seeded(1), dtype=torch.float64)
 
 
 def disturbed(plant, scale=1.0):

@@ -26,7 +26,6 @@ from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.runs.command_line import from_command_line
 
 CLASSES = {"linear_quadratic": LinearQuadratic} | rt.shipped_plants()
-GREATEST_EPISODE = 200
 
 
 def shortened(kind, steps):
@@ -78,15 +77,6 @@ def test_an_extension_has_the_scheme_of_its_plant_unless_hidden_states_have_thei
     assert [plant.own_scheme for plant in found] == [False, True, True, True]
 
 
-def fly(plant, *, seed=0):
-    """A real episode under the plant's initial policy, with the policy."""
-    policy = plant.make_policy(seeded(5))
-    env = rt.PlantEnv(plant, seed=seed)
-    with torch.no_grad():
-        episode = env.rollout(plant.n_steps + 10, TensorDictModule(policy, ["observation"], ["action"]))
-    return episode, policy
-
-
 def test_fulfils_the_contract(kind, plant):
     assert rt.check_plant(plant, episodes=2, steps=10).untraceable is None
     assert CLASSES[plant.name] is kind
@@ -94,8 +84,11 @@ def test_fulfils_the_contract(kind, plant):
 
 
 def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
-    plant = shortened(kind, GREATEST_EPISODE)
-    episode, policy = fly(plant)
+    plant = shortened(kind, 200)
+    policy = plant.make_policy(seeded(5))
+    with torch.no_grad():
+        acting = TensorDictModule(policy, ["observation"], ["action"])
+        episode = rt.PlantEnv(plant, seed=0).rollout(plant.n_steps + 10, acting)
     assert episode["next", "truncated"].flatten().tolist() == [False] * (plant.n_steps - 1) + [True]
     assert not episode["next", "terminated"].any()
     twin = rt.DigitalTwin(plant, plant.closure)

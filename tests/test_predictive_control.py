@@ -43,19 +43,14 @@ def test_a_window_that_nobody_set_has_twenty_commands_or_a_quarter_of_the_episod
     assert PredictiveConfig(hold=hold).length(LinearQuadratic(dt=dt, horizon=horizon)) == pytest.approx(expected)
 
 
-def on_the_real_system(controller, env, *, strength=0.0):
-    """An episode as step 1 flies it."""
-    actor = LivePolicy(env.plant, controller, ExplorationConfig(), generator=seeded())
-    actor.begin(controller, strength=strength)
-    return collector_of(env, actor, env.plant).rollout()[0]
-
-
 @pytest.mark.parametrize("forecast", ["held", "decaying"])
 def test_it_acts_on_the_real_system_as_it_flies_in_simulation(forecast):
     controller = control(forecast=forecast)
     controller.learn(PLANT.draw_exogenous(30, seeded(5)))
     assert isinstance(controller, StateFeedback)
-    flown = on_the_real_system(controller, PlantEnv(PLANT, seed=4))
+    actor = LivePolicy(PLANT, controller, ExplorationConfig(), generator=seeded())
+    actor.begin(controller, strength=0.0)
+    flown = collector_of(PlantEnv(PLANT, seed=4), actor, PLANT).rollout()[0]  # as step 1 flies it
     expected = controller.fly(flown["state"][:1], flown["exogenous"][None])
     torch.testing.assert_close(flown["next", "applied"], expected.actions[0], rtol=1e-9, atol=1e-9)
     cost = control_cost(PLANT, expected)[0]

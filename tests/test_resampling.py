@@ -32,9 +32,6 @@ from rt_torchrl.fit.resampling import (
 from rt_torchrl.steps.assimilate import Assimilation
 from rt_torchrl.steps.hypotheses.assimilation import reread
 
-record_log = recipe("record_log")
-policy_law, recorded = record_log.policy_law, record_log.recorded
-
 pd = pytest.importorskip("pandas")
 PLANT = LinearQuadratic(dt=0.1)
 TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,1,0,b\n250,3000,0.3,-1,0.5,c\n"
@@ -239,9 +236,6 @@ def test_a_periodic_state_is_interpolated_across_its_seam(counted):
     assert (np.abs(found) <= math.pi).all() and segment.exogenous.shape == (len(found) - 1, 0)
 
 
-TESTS = Path(__file__).parent
-
-
 def log_of(plant, states, rows=40):
     """A log with constants for the drive and a ramp for each of these states."""
     driven = {signal.name: np.full(rows, max(signal.low, 1.0)) for signal in (*plant.actions, *plant.inputs)}
@@ -299,7 +293,7 @@ def room_log(tmp_path):
     rows = {"time": 300.0 * np.arange(200), "air": record.readings[:200, 0]}
     rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:200, 0]}
     pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
-    text = (TESTS / "small_plants.py").read_text()
+    text = Path(__file__).with_name("small_plants.py").read_text()
     made = "    def make_closure(self, generator):\n        return Envelope(torch.tensor([30.0, 150.0, 8.0]))\n\n"
     made += "    def running_cost(self): ...\n    def draw_exogenous(self): ...\n    def observe(self): ...\n"
     text = text.replace("    observe = running_cost = draw_exogenous = make_closure = None", made)

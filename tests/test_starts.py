@@ -20,8 +20,7 @@ from rt_torchrl.steps.switch import clones
 
 pytestmark = pytest.mark.training
 
-record_log = recipe("record_log")
-recorded = record_log.recorded
+recorded = recipe("record_log").recorded
 
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(

@@ -110,9 +110,6 @@ def test_a_twin_that_diverges_on_some_episodes_is_infinitely_wrong_there_alone()
 # Policies that observe past observations: by hand, in both engines, with extensions, in C, in runs and from logs.
 
 
-DT = 0.1
-
-
 class Timed(LinearQuadratic):
     """The oracle plant, of which policies observe what depends on time, state and input."""
 
@@ -174,7 +171,7 @@ class Mass(LinearQuadratic):
 
 @needs_compiler
 def test_the_controller_in_c_holds_the_past_observations(tmp_path):
-    plant = rt.StackedObservations(Mass(dt=DT, horizon=5.0), 2)
+    plant = rt.StackedObservations(Mass(dt=0.1, horizon=5.0), 2)
     agreement = rt.export_controller(LinearGain([[3.0, -2.0, 0.5]]), tmp_path / "mass.c", plant, name="mass")
     assert agreement < 1e-12
     in_c, positions = InC(tmp_path / "mass.c", 1, 2, 1), [0.3, 0.5, -0.2, 0.1, 0.4]

@@ -46,7 +46,7 @@ def torque(c_p, omega, beta, u):
     return 0.5 * RHO * math.pi * R**2 * c_p(omega * R / u, beta) * u**3 / omega
 
 
-def start(plant, omega, *, u, command=(0.0, 0.0)):
+def start(omega, *, u, command=(0.0, 0.0)):
     """A state with settled filters and the actuators at the command."""
     return torch.tensor([[omega, N_G * omega, u, 0.0, *command]], dtype=torch.float64)
 
@@ -73,7 +73,7 @@ def test_time_constant_of_the_drivetrain(c_p):
 def test_settles_where_the_torques_balance(c_p, u, beta, tau_g, bracket):
     root = brentq(lambda omega: torque(c_p, omega, beta, u) - N_G * tau_g, *bracket, xtol=1e-12)
     plant = WindTurbine(horizon=1200.0, wind=KaimalWind(mean=u, intensity=0.0))
-    end = fly(plant, start(plant, 1.05 * root, u=u, command=(tau_g, beta)), u, (tau_g, beta))[-1]
+    end = fly(plant, start(1.05 * root, u=u, command=(tau_g, beta)), u, (tau_g, beta))[-1]
     # 1200 s are above 40 time constants there; what is left is the agreement of the splines, 1e-11.
     assert end[0].item() == pytest.approx(root, rel=1e-8)
     assert end[1].item() == pytest.approx(N_G * root, rel=1e-8)
@@ -89,7 +89,7 @@ def test_optimal_gain_takes_the_greatest_power(c_p):
     # Grid spacing 1e-4 in λ: 1e-4/7.6 in λ³ three times over.
     assert plant.optimal_gain * omega_g**3 == pytest.approx(0.5 * RHO * math.pi * R**2 * best * u**3, rel=1e-4)
     command = (plant.optimal_gain * omega_g**2, 0.0)
-    end = fly(plant, start(plant, omega_g / N_G, u=u, command=command), u, command)[-1]
+    end = fly(plant, start(omega_g / N_G, u=u, command=command), u, command)[-1]
     # The same 1e-4 in torque, over the slope of the balance, ∂ln τ/∂ln ω = −1 at the optimum.
     assert end[0].item() == pytest.approx(omega_g / N_G, rel=3e-4)
 
@@ -109,7 +109,7 @@ def test_reference_speed_in_its_three_regions(u, expected):
 @pytest.mark.parametrize("dt", [0.5, 0.25])
 def test_actuators_move_by_no_more_than_their_rates_times_the_interval(dt):
     plant = WindTurbine(dt=dt)
-    state = start(plant, 1.2, u=11.0, command=(20e3, 10.0))
+    state = start(1.2, u=11.0, command=(20e3, 10.0))
     assert plant.actuate(state, double(43e3, 0.0)).tolist() == [[20e3 + 15e3 * dt, 10.0 - 8.0 * dt]]
     assert plant.actuate(state, double(20.1e3, 9.9)).tolist() == [[20.1e3, 9.9]]
 
@@ -130,7 +130,7 @@ def test_cost_counts_speed_and_power_errors():
     omega = OMEGA_RATED
     power = min(5e6, plant.optimal_gain * (N_G * omega) ** 3) - 0.2 * 5e6
     applied = torch.tensor([[power / (N_G * omega), 0.0]], dtype=torch.float64)
-    state = start(plant, omega, u=15.0)
+    state = start(omega, u=15.0)
     state[0, 1] = 122.9096 + 0.1 * 20.0
     cost = plant.running_cost(torch.zeros(1).double(), state, applied, torch.full((1, 1), 15.0).double())
     assert cost.item() == pytest.approx(0.5 * (2.0 * 0.01 + 3.0 * 0.04), rel=1e-12)
@@ -139,7 +139,7 @@ def test_cost_counts_speed_and_power_errors():
 def test_error_integral_is_an_exponential_window_of_one_revolution():
     """At constant e_1 the window gives e_2 = e_1(1 − e^{−t/T_r}), T_r = 2π/ω_rated."""
     plant = WindTurbine(horizon=60.0, inertia=FROZEN)
-    states = fly(plant, start(plant, 1.1, u=11.0), 11.0, (0.0, 0.0))
+    states = fly(plant, start(1.1, u=11.0), 11.0, (0.0, 0.0))
     e_1 = (N_G * 1.1 - 122.9096) / 20.0
     t = 0.5 * torch.arange(plant.n_steps + 1, dtype=torch.float64)
     expected = e_1 * (1.0 - torch.exp(-t * OMEGA_RATED / (2 * math.pi)))
@@ -151,7 +151,7 @@ def test_filters_are_the_exponential_recursion_for_held_inputs():
     """û_{k+1} = α û_k + (1 − α) u_k with α = exp(−2π·0.04·dt)."""
     plant = WindTurbine(horizon=100.0, inertia=FROZEN)
     wind = 8.0 + 6.0 * torch.rand(plant.n_steps, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    initial = start(plant, 1.2, u=9.0)
+    initial = start(1.2, u=9.0)
     initial[0, 1] = 80.0
     states = fly(plant, initial, wind, (0.0, 0.0)).numpy()
     alpha, u_hat, omega_hat = math.exp(-2 * math.pi * 0.04 * 0.5), 9.0, 80.0
@@ -248,7 +248,7 @@ def test_the_torque_joins_its_regions_continuously(controller):
 
 def test_the_pitch_is_the_scheduled_pi_law_by_hand(controller):
     speed, integral, pitch = 130.0, 3.0, math.radians(5.0)
-    state = start(controller.plant, speed / N_G, u=15.0, command=(43e3, 5.0))
+    state = start(speed / N_G, u=15.0, command=(43e3, 5.0))
     command, memory = controller.law(state, double(speed, integral).unsqueeze(0), torch.zeros(1, 1).double())
     integral += 0.5 * (speed - 122.9096)
     expected = (0.01882681 * (speed - 122.9096) + 0.008068634 * integral) / (1.0 + pitch / 0.1099965)
@@ -292,9 +292,6 @@ def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
 # ROSCO's simulator of the same turbine: against our plant, as a real system, and under ROSCO's own controller.
 
 
-HORIZON = 60.0
-
-
 @pytest.fixture(scope="module")
 def rosco():
     return pytest.importorskip("rosco")
@@ -310,7 +307,7 @@ def flown(plant, command, seed=0):
 @pytest.mark.parametrize("observe", ["paper", "scheduled"])
 def test_our_plant_goes_where_rosco_goes(rosco, observe, monkeypatch):
     """Two codes, one turbine: they part by the error of ROSCO's Euler steps, which is of first order."""
-    plant = WindTurbine(horizon=HORIZON, inertia=float(nrel5mw().J), observe=(observe,))
+    plant = WindTurbine(horizon=60.0, inertia=float(nrel5mw().J), observe=(observe,))
     errors = []
     for step in (0.1, 0.05):
         monkeypatch.setattr(adapter, "STEP", step)
