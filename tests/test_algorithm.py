@@ -11,18 +11,16 @@ from seeds_and_numbers import seeded
 from small_runs import IDLE
 from tensordict import TensorDict
 
-from rt_torchrl import DescentConfig, DigitalTwin, DivergenceError, ExplorationConfig, PlantEnv, ReinforcementTwinning
+import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.config import AssimilationConfig, LearnerConfig, PlannerConfig, RefereeConfig, TwinningConfig
 from rt_torchrl.steps.report import metrics, same_architecture
 from rt_torchrl.steps.switch import other_than
 
 STEPS = ["interact", "learn", "inputs", "assimilate", "plan", "switch"]
 
 
-LEARNING = LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16)
+LEARNING = rt.LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16)
 
 
 def twinning(
@@ -35,15 +33,15 @@ def twinning(
         "realisations": 2,
         "virtual_episodes": 3,
         "learner": IDLE,
-        "assimilation": AssimilationConfig(iterations=2),
-        "planner": PlannerConfig(iterations=2, starts=0, descent=DescentConfig(rate=0.01)),
+        "assimilation": rt.AssimilationConfig(iterations=2),
+        "planner": rt.PlannerConfig(iterations=2, starts=0, descent=rt.DescentConfig(rate=0.01)),
     }
-    return ReinforcementTwinning(
-        env or PlantEnv(plant, seed=env_seed),
-        DigitalTwin(plant, closure or plant.make_closure(generator)),
+    return rt.ReinforcementTwinning(
+        env or rt.PlantEnv(plant, seed=env_seed),
+        rt.DigitalTwin(plant, closure or plant.make_closure(generator)),
         model_free=model_free or plant.make_policy(generator),
         model_based=model_based or plant.make_policy(generator),
-        config=TwinningConfig(**usual | options),
+        config=rt.TwinningConfig(**usual | options),
         generator=generator,
         first=first,
     )
@@ -82,7 +80,7 @@ def test_steps_come_in_order(arm, expected):
 
 def test_what_is_stored_is_what_was_applied():
     """The turbine's rate limits change most commands of a policy with noise."""
-    found, rollouts = twinning(WindTurbine(horizon=30.0), exploration=ExplorationConfig(spread=1.0, episodes=5)), []
+    found, rollouts = twinning(WindTurbine(horizon=30.0), exploration=rt.ExplorationConfig(spread=1.0, episodes=5)), []
     fly = found.collector.rollout
     found.collector.rollout = lambda: rollouts.append(fly()) or rollouts[-1]
     found.steps["learn"].store(flown(found)["transitions"].values())
@@ -100,13 +98,13 @@ def test_what_is_stored_is_what_was_applied():
 @pytest.mark.parametrize("inputs", ["record", "realisations"])
 def test_the_true_twin_replays_the_record_exactly_under_the_measured_input_only(inputs):
     closure = LinearClosure(LinearQuadratic.true_closure)
-    found = twinning(closure=closure, assimilation=AssimilationConfig(iterations=1, inputs=inputs))
+    found = twinning(closure=closure, assimilation=rt.AssimilationConfig(iterations=1, inputs=inputs))
     J_p = flown(found, "interact", "inputs", "assimilate")["J_p_before"].item()
     assert (J_p < 1e-20) == (inputs == "record")
 
 
 def test_live_starts_model_free_and_explores_less_and_less():
-    found = twinning(arm="model_free", exploration=ExplorationConfig(spread=0.2, episodes=4))
+    found = twinning(arm="model_free", exploration=rt.ExplorationConfig(spread=0.2, episodes=4))
     assert found.referee.live == "model_free" and found.actor.policy is found.policies["model_free"]
     strengths = [found.episode()["exploration"] for _ in range(6)]
     assert strengths == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
@@ -114,7 +112,7 @@ def test_live_starts_model_free_and_explores_less_and_less():
 
 @pytest.mark.parametrize("live", ["model_free", "model_based"])
 def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
-    found = twinning(learner=LEARNING, referee=RefereeConfig(clone_patience=0))
+    found = twinning(learner=LEARNING, referee=rt.RefereeConfig(clone_patience=0))
     found.referee.live = live
     episode = flown(found, *STEPS[:-1])
     optimisers = {
@@ -134,7 +132,7 @@ def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
 def test_planning_finds_the_optimal_gain():
     """The best constant gain on the true twin is Riccati's over 10 s, which are ten time constants of the loop."""
     plant, closure = LinearQuadratic(horizon=10.0, noise=0.0), LinearClosure(LinearQuadratic.true_closure)
-    planner = PlannerConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+    planner = rt.PlannerConfig(iterations=40, descent=rt.DescentConfig(optimiser="lbfgs", rate=1.0))
     found = twinning(plant, closure=closure, arm="model_based", realisations=8, planner=planner)
     episode = flown(found, "interact", "inputs")
     report = flown(found, "plan", episode=episode)
@@ -147,7 +145,7 @@ def test_planning_finds_the_optimal_gain():
 def test_a_step_of_ones_own_flows_with_the_others():
     """The twin is the real system, so that the residual of the page is rounding."""
     closure = LinearClosure(LinearQuadratic.true_closure)
-    found = twinning(closure=closure, assimilation=AssimilationConfig(iterations=0))
+    found = twinning(closure=closure, assimilation=rt.AssimilationConfig(iterations=0))
     found.insert("residual", documented("method.md", "Residual")(found.twin), before="plan")
     report = found.episode()
     assert report["residual"] < 1e-9 and list(report["seconds"].keys()) == [*STEPS[:4], "residual", *STEPS[4:]]
@@ -176,18 +174,18 @@ PLANT = LinearQuadratic(horizon=2.0)
 
 
 def affine(*rows):
-    policy = SaturatedAffine(2, PLANT.actions, generator=seeded(0))
+    policy = rt.SaturatedAffine(2, PLANT.actions, generator=seeded(0))
     with torch.no_grad():
         policy.linear.weight.copy_(torch.tensor(rows))
     return policy
 
 
 def perceptron(seed=1):
-    return SaturatedMLP(2, PLANT.actions, hidden=(16, 16), generator=seeded(seed))
+    return rt.SaturatedMLP(2, PLANT.actions, hidden=(16, 16), generator=seeded(seed))
 
 
 def two_architectures(**options):
-    options = {"learner": LEARNING, "referee": RefereeConfig(clone_patience=0), **options}
+    options = {"learner": LEARNING, "referee": rt.RefereeConfig(clone_patience=0), **options}
     policies = {"model_free": perceptron(), "model_based": affine([-0.8, -1.1])}
     return twinning(PLANT, seed=9, closure=LinearClosure(PLANT.true_closure), **policies, **options)
 
@@ -302,12 +300,12 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step, we
 @pytest.mark.parametrize("live, idle", [("model_free", "model_based"), ("model_based", "model_free")])
 def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch, live, idle):
     """The closure that was just found stays, the training goes on, and the live policy stays live."""
-    found = twinning(referee=RefereeConfig(patience=0))
+    found = twinning(referee=rt.RefereeConfig(patience=0))
     found.referee.live, cost = live, found.twin.cost
 
     def checked(policy, *episodes):
         if policy is found.policies[idle]:
-            raise DivergenceError("plant 'linear_quadratic' diverged")
+            raise rt.DivergenceError("plant 'linear_quadratic' diverged")
         return cost(policy, *episodes)
 
     monkeypatch.setattr(found.twin, "cost", checked)
@@ -332,7 +330,7 @@ def ruined_by(half, method, policy, monkeypatch):
 
 def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monkeypatch):
     """The weights that flew are sound; those that step 2 made of them diverge, cost infinitely much and lose."""
-    found = twinning(referee=RefereeConfig(rule="decision_tree", patience=0))
+    found = twinning(referee=rt.RefereeConfig(rule="decision_tree", patience=0))
     ruined_by(found.learner, "update", found.policies["model_free"], monkeypatch)
     report = found.episode()
     assert report["closure_refused"] == 0.0 and report["J_a_model_free"].isinf()
@@ -359,12 +357,12 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
     def interrupted(episodes):
         fill(found.policies["model_based"], 0.0)
         planned.append("unsound")
-        raise KeyboardInterrupt if len(planned) > closures else DivergenceError("the twin diverged")
+        raise KeyboardInterrupt if len(planned) > closures else rt.DivergenceError("the twin diverged")
 
     def unsound_twin(*arguments):
         if planned and planned[-1] == "unsound":
             planned[-1] = "told"
-            raise DivergenceError("the twin diverged under what has flown")
+            raise rt.DivergenceError("the twin diverged under what has flown")
 
     monkeypatch.setattr(found.planner, "plan", interrupted)
     monkeypatch.setattr(found.belief, "require_sound_twin", unsound_twin)
@@ -375,7 +373,7 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
 
 @pytest.mark.parametrize("method", ["adam", "levenberg_marquardt"])
 def test_a_fit_begins_anew_where_the_present_closure_diverges_and_the_first_one_does_not(method):
-    found = twinning(assimilation=AssimilationConfig(iterations=2, segment=0, method=method))
+    found = twinning(assimilation=rt.AssimilationConfig(iterations=2, segment=0, method=method))
     found.episode()
     fill(found.twin.closure, 1e3)
     report = found.episode()

@@ -9,7 +9,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from seeds_and_numbers import drawn
 
-from rt_torchrl import DigitalTwin, ExogenousConfig, Extension, LaggedActuator, Plant, Signal, Transition
+import rt_torchrl as rt
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.unknown import unknown as tank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -17,26 +17,24 @@ from rt_torchrl.envs.flapping_wing.unknown import unknown as drone
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import unknown as turbine
 from rt_torchrl.steps.belief import ANCHORS, LENGTH, NOISE, Belief
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.steps.hypotheses.ensemble import ALONE
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.anchored import Anchored, AnchoredReplays
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 
 def flown_on(real, policy, physics, *, seed=0, count=2):
     """Records of the real system under a policy, the inputs, and J_a."""
     starts, inputs = drawn(real, count, seed)
     with torch.no_grad():
-        rollout = Rollout(real, real.closure, policy)
+        rollout = rt.Rollout(real, real.closure, policy)
         flown, costs = rollout(starts, inputs), rollout.costs(starts, inputs)
     states = flown.states[..., : len(physics.readings)]
-    return [Trajectory(states[k], flown.actions[k], inputs[k]) for k in range(count)], inputs, costs
+    return [rt.Trajectory(states[k], flown.actions[k], inputs[k]) for k in range(count)], inputs, costs
 
 
 def replays_on(plant, records, inputs, costs, policy, closure=None):
     """Replays of what one policy has flown, on a twin."""
-    twin = DigitalTwin(plant, closure or plant.closure)
+    twin = rt.DigitalTwin(plant, closure or plant.closure)
     return AnchoredReplays(twin, twin.of(Anchored(plant)), records, inputs, costs, lambda k: policy)
 
 
@@ -58,7 +56,7 @@ class Whole(LinearQuadratic):
 
     def step(self, t, state, command, exogenous, closure):
         end, applied = super().step(t, state, command, exogenous, closure)
-        return Transition(end + 1e-3, applied)
+        return rt.Transition(end + 1e-3, applied)
 
 
 SHIPPED = {
@@ -89,13 +87,13 @@ def test_the_replay_of_what_flew_is_the_real_episode(name, suspected):
     assert torch.equal(replays.flown[0], replays.actions(policy)) and replays.explored.tolist() == [0.0, 0.0]
 
 
-class Pushed(Extension):
+class Pushed(rt.Extension):
     """A plant on which more acts than its sensor reads, a wave with a random amplitude and phase."""
 
-    advance = Plant.advance
+    advance = rt.Plant.advance
 
     def __init__(self, base):
-        super().__init__(base, [Signal(symbol=part, name=f"unread_{part}", unit="N") for part in "pq"])
+        super().__init__(base, [rt.Signal(symbol=part, name=f"unread_{part}", unit="N") for part in "pq"])
 
     def vector_field(self, t, state, action, exogenous, closure):
         base, hidden = self.split(state)
@@ -121,7 +119,7 @@ def test_an_unread_force_on_a_linear_plant_is_replayed_exactly_under_any_policy(
     other = LinearGain([[3.0, 2.0]])
     real, inputs, _, replays = replayed(LinearGain([[0.5, 0.5]]))
     starts = real.draw_initial_state(2, torch.Generator().manual_seed(0))
-    true = Rollout(real, real.closure, other).costs(starts, inputs).tolist()
+    true = rt.Rollout(real, real.closure, other).costs(starts, inputs).tolist()
     assert anchored_costs(replays, other).tolist() == pytest.approx(true, rel=1e-9)
     alone = replays.twin.episode_costs(other, replays.starts, inputs).tolist()
     assert alone != pytest.approx(true, rel=0.1)
@@ -168,8 +166,8 @@ def test_what_sensors_do_not_read_of_a_cost_counts(reported, counts):
 def belief_of(gains, real=None, physics=None, *, twin=None):
     """The belief after one flight with each of some gains, under other inputs; by default of the pushed plant."""
     real, physics = (real, physics or real) if real else pushed()
-    twin = twin or DigitalTwin(physics, physics.closure)
-    virtual = VirtualEpisodes(twin, ExogenousConfig(), 3, generator=torch.Generator().manual_seed(0))
+    twin = twin or rt.DigitalTwin(physics, physics.closure)
+    virtual = VirtualEpisodes(twin, rt.ExogenousConfig(), 3, generator=torch.Generator().manual_seed(0))
     belief = Belief({"model_based": LinearGain([[0.0, 0.0]])}, virtual)
     for seed, gain in enumerate(gains):
         policy = LinearGain([gain])
@@ -228,7 +226,7 @@ class Told:
     def corrections(self, policy):
         told = self.told[round(10.0 * policy.gain[0, 0].item())]
         if told is None:
-            raise DivergenceError
+            raise rt.DivergenceError
         return torch.tensor(told).double()
 
 
@@ -258,8 +256,8 @@ def test_noise_and_growth_are_the_most_likely_ones(scatter, slope, explored, apa
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 1.0])
 def test_an_episode_that_flew_costs_what_it_did_whatever_hypotheses_weigh(share):
     real, physics = pushed()
-    suspect = LaggedActuator(physics, "force", 0.5)
-    twin = TwinEnsemble(physics, physics.closure, {"lags": suspect}, {"lags": suspect.closure})
+    suspect = rt.LaggedActuator(physics, "force", 0.5)
+    twin = rt.TwinEnsemble(physics, physics.closure, {"lags": suspect}, {"lags": suspect.closure})
     twin.weights = {name: weight for name, weight in ((ALONE, 1.0 - share), ("lags", share)) if weight}
     belief, policy = belief_of([(0.5, 0.5)], twin=twin), LinearGain([[0.5, 0.5]])
     (record,), inputs, cost = flown_on(real, policy, physics, count=1)
@@ -331,17 +329,12 @@ def test_plans_on_expected_costs_find_what_the_twin_alone_does_not():
     true, expected, alone = (
         torch.autograd.grad(costs.mean().log(), [policy.gain])[0]
         for costs in (
-            Rollout(real, real.closure, policy).costs(start, inputs),
+            rt.Rollout(real, real.closure, policy).costs(start, inputs),
             twin.expected_costs(policy, record.states[:1], inputs),
             twin.episode_costs(policy, record.states[:1], inputs),
         )
     )
     assert torch.allclose(expected, true, rtol=1e-6) and not torch.allclose(alone, true, rtol=0.05)
-
-
-def virtual_episodes(physics, count=20):
-    generator = torch.Generator().manual_seed(99)
-    return Scenario(physics.draw_initial_state(count, generator), physics.draw_exogenous(count, generator))
 
 
 def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
@@ -355,7 +348,7 @@ def test_weights_that_flew_are_dear_also_where_no_episode_can_be_replayed():
 
 
 def test_the_best_that_flew_is_found_whatever_was_computed_before():
-    gains, episodes = [(2.0, 0.5), (0.5, 0.5), (1.0, 0.5)], virtual_episodes(LinearQuadratic())
+    gains, episodes = [(2.0, 0.5), (0.5, 0.5), (1.0, 0.5)], rt.Scenario(*drawn(LinearQuadratic(), 20, 99))
     fresh, warm, like = belief_of(gains), belief_of(gains), LinearGain([[0.0, 0.0]])
     warm.anchors()
     (weights, judged), (same, again) = fresh.best_flown(like, episodes), warm.best_flown(like, episodes)

@@ -179,15 +179,10 @@ def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
 
 
 def test_the_cheaper_policy_acts():
-    referee = DecisionTree(RefereeConfig(clone_patience=0), "model_free")
-
-    def decided(live, idle, change=1.0):
-        return referee.decide(Evidence(live, idle, change)), referee.live
-
-    assert decided(1.0, 1.0) == ("keep", "model_free")
-    assert decided(1.0, 0.999) == ("swap", "model_based")
-    assert decided(1.0, math.inf, change=0.0) == ("clone", "model_based")
-    assert decided(math.inf, math.inf) == ("keep", "model_based")
+    referee, inf = DecisionTree(RefereeConfig(clone_patience=0)), math.inf
+    script = [(1.0, 1.0, 1.0), (1.0, 0.999, 1.0), (1.0, inf, 0.0), (inf, inf, 1.0)]
+    assert [referee.decide(Evidence(*evidence)) for evidence in script] == ["keep", "swap", "clone", "keep"]
+    assert referee.live == "model_based"
 
 
 class Hasty:

@@ -12,15 +12,12 @@ from small_runs import SMALL, small_run
 from test_export_recipe import recipe
 
 import rt_torchrl as rt
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.export.c_file import c_array
-from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.runs.results import twin_entries
 from rt_torchrl.runs.table import results_table
 from rt_torchrl.steps.assimilate import Assimilation
-from rt_torchrl.steps.config import AssimilationConfig, HypothesesConfig
 from rt_torchrl.steps.hypotheses.assimilation import (
     LEAST,
     EnsembleAssimilation,
@@ -31,16 +28,15 @@ from rt_torchrl.steps.hypotheses.assimilation import (
     reread,
 )
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
+from rt_torchrl.trajectories.trajectory import batch_of
 
 LAG = 0.6
-ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
+ASSIMILATION = rt.AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
 
 
 class Suspecting(LinearQuadratic):
     def suspects(self):
-        return {"late": DelayedActuator(self, "force", 0.2), "lags": LaggedActuator(self, "force", 0.2)}
+        return {"late": rt.DelayedActuator(self, "force", 0.2), "lags": rt.LaggedActuator(self, "force", 0.2)}
 
 
 def recorded(plant, steps=100):
@@ -49,14 +45,14 @@ def recorded(plant, steps=100):
     state = plant.draw_initial_state(1, generator)
     exogenous = torch.zeros(1, steps, 1, dtype=torch.float64)
     held = 4.0 * torch.rand(1, steps // 10, 1, generator=generator, dtype=torch.float64) - 2.0
-    flown = Rollout(plant, plant.closure)(state, exogenous, held.repeat_interleave(10, 1))
+    flown = rt.Rollout(plant, plant.closure)(state, exogenous, held.repeat_interleave(10, 1))
     read = flown.states[0, :, : len(plant.readings)]
-    return Trajectory(read, flown.actions[0], exogenous[0]), flown.states[0]
+    return rt.Trajectory(read, flown.actions[0], exogenous[0]), flown.states[0]
 
 
 def ensemble(plant, call=0.0, *, always=False, **options):
     closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
-    config = HypothesesConfig(call=call, **options)
+    config = rt.HypothesesConfig(call=call, **options)
     twin = make_twin(plant, closure, config)
     return twin, EnsembleAssimilation(twin, ASSIMILATION, config, always=always)
 
@@ -78,7 +74,7 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
     gradients = {}
     for engine in ("native", "odeint_adjoint"):
         closure = LinearClosure([[0.0, 0.0], [-0.2, 0.1]])
-        twin = make_twin(plant, closure, HypothesesConfig(), engine=engine)
+        twin = make_twin(plant, closure, rt.HypothesesConfig(), engine=engine)
         for name in twin.twins:
             twin.weights = {name: 1.0}
             gradients[engine, name] = torch.autograd.grad(twin.cost(policy, *scenario), policy.gain)[0]
@@ -87,12 +83,12 @@ def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continu
 
 
 def test_hidden_states_follow_from_what_was_read():
-    real = LaggedActuator(PLANT, "force", LAG)
+    real = rt.LaggedActuator(PLANT, "force", LAG)
     record, states = recorded(real)
     twin = rt.DigitalTwin(real, real.closure)
     torch.testing.assert_close(twin.followed(record), states, rtol=1e-12, atol=1e-12)
     wild = record._replace(exogenous=record.exogenous + 1e308, actions=record.actions * 1e308)
-    with pytest.raises(DivergenceError, match="is not finite"):
+    with pytest.raises(rt.DivergenceError, match="is not finite"):
         twin.followed(wild)
     assert misfit(twin, [wild], 5) == float("inf") > misfit(twin, [record], 5)  # which costs a hypothesis its weight
 
@@ -102,7 +98,7 @@ def test_recorded_actions_act_as_they_are_on_what_is_behind_the_actuators(lag):
     """A log whose force jumps is replayed without the rate limit, which commands pass; a lag follows the jumps."""
     A, B, _, _ = discretised()
     base = Slewing()
-    plant = base if lag is None else LaggedActuator(base, "force", lag)
+    plant = base if lag is None else rt.LaggedActuator(base, "force", lag)
     forces, s, x = [1.5] * 10 + [-2.0] * 10, double(0.4, -0.1).numpy(), 0.0
     states = [[*s, 0.0, *([] if lag is None else [x])]]
     for a in forces:
@@ -130,7 +126,7 @@ def test_recorded_actions_act_as_they_are_on_what_is_behind_the_actuators(lag):
 
 def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_states():
     """The oracle replays every segment from readings and hidden states, which the same closure gives."""
-    real = LaggedActuator(PLANT, "force", LAG)
+    real = rt.LaggedActuator(PLANT, "force", LAG)
     record, _ = recorded(real)
     twin = rt.DigitalTwin(real, rt.ExtendedClosure(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), real.closure.own))
     reading, again = twin.of(Reread(real)), reread(record, real, 20)
@@ -144,7 +140,7 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
 
 
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    twin, assimilation = fitted(rt.LaggedActuator(PLANT, "force", LAG), PLANT)
     assert twin.weights == {"lags": 1.0} and twin.likeliest == "lags"
     assert twin.twins["lags"].closure.named_coefficients()["force_lag"].item() == pytest.approx(LAG, rel=1e-3)
     torch.testing.assert_close(twin.twins["lags"].closure.base.matrix, PLANT.closure.matrix, rtol=0.0, atol=2e-3)
@@ -156,14 +152,14 @@ def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
 def whole_cost(twin, record):
     """J_p of a whole record, summed here over its samples."""
     start = twin.plant.at_rest(record.states[:1])
-    flown = Rollout(twin.plant, twin.closure)(start, record.exogenous[None], record.actions[None])
+    flown = rt.Rollout(twin.plant, twin.closure)(start, record.exogenous[None], record.actions[None])
     read = flown.states[0, 1:, : record.states.shape[-1]]
     return (PLANT.dt * PLANT.discrepancy(read, record.states[1:])).sum().item()
 
 
 def test_an_episode_reports_the_twin_that_is_believed():
     """J_p before is that of the closure that was believed before the fit, on the record that it has not seen."""
-    real = LaggedActuator(PLANT, "force", LAG)
+    real = rt.LaggedActuator(PLANT, "force", LAG)
     (record, _), shorter = recorded(real), recorded(real, steps=50)[0]
     twin, assimilation = ensemble(PLANT)
     found = assimilation.update([shorter])
@@ -185,7 +181,7 @@ def test_an_episode_reports_the_twin_that_is_believed():
 
 def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
     """The hypothesis that is right replays any segments exactly, in a training, its figures and on unseen episodes."""
-    real = LaggedActuator(PLANT, "force", LAG)
+    real = rt.LaggedActuator(PLANT, "force", LAG)
     (record, states), twin = recorded(real), rt.DigitalTwin(real, real.closure)
     fit, unseen = Fit(twin, ASSIMILATION, 2), UnseenEpisodes(real, 2)
     for fit.whole.length in (0, 7, 25):
@@ -224,7 +220,7 @@ def test_weights_ask_for_evidence():
 
 def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(monkeypatch):
     twin, assimilation = ensemble(PLANT, call=0.05)
-    lagging, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    lagging, _ = recorded(rt.LaggedActuator(PLANT, "force", LAG))
     assimilation.update([lagging])
     assert not assimilation.explain(0.04)
     weights = {name: share for name, share in assimilation.report().items() if not name.startswith("rms/")}
@@ -264,8 +260,8 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
 def test_hypotheses_are_chosen_by_name():
     twin, _ = ensemble(PLANT, which=("late",))
     assert list(twin.twins) == [ALONE, "late"]
-    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which=("none",)))) is rt.DigitalTwin
-    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is rt.DigitalTwin
+    assert type(make_twin(PLANT, PLANT.closure, rt.HypothesesConfig(which=("none",)))) is rt.DigitalTwin
+    assert type(make_twin(LinearQuadratic(), PLANT.closure, rt.HypothesesConfig())) is rt.DigitalTwin
 
 
 # What is said of a twin with hypotheses is said of the likeliest one: simulations, results, exports and prices.
@@ -279,7 +275,7 @@ class Config(rt.RunConfig):
     """A system whose actuator lags, and a twin that suspects lag and dead time."""
 
     def plant(self):
-        return LaggedActuator(Suspecting(horizon=4.0), "force", SHORT_LAG)
+        return rt.LaggedActuator(Suspecting(horizon=4.0), "force", SHORT_LAG)
 
     def believed(self):
         return Suspecting(horizon=4.0)
@@ -290,7 +286,7 @@ def run(tmp_path_factory):
     """A training of one episode, in which the right hypothesis takes over."""
     folder = tmp_path_factory.mktemp("believed")
     assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
-    hypotheses = HypothesesConfig(call=0.0, which=("lags",))
+    hypotheses = rt.HypothesesConfig(call=0.0, which=("lags",))
     twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
     small_run(folder, 1, Config().plant(), config=Config, twinning=twinning).train()
     return rt.load_run(folder, Config)
@@ -348,7 +344,7 @@ def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, mon
 @needs_compiler
 def test_unread_states_are_started_in_c(tmp_path):
     """An actuator at rest stands at zero; a sensor's bias shows from the first interval on."""
-    plant = rt.BiasedSensor(LaggedActuator(LinearQuadratic(), "force", SHORT_LAG), "position", 0.5, scale=1.0)
+    plant = rt.BiasedSensor(rt.LaggedActuator(LinearQuadratic(), "force", SHORT_LAG), "position", 0.5, scale=1.0)
     closure = plant.extended(LinearClosure([[0.05, 0.0], [-0.4, 0.2]]))
     assert rt.export_twin(closure, tmp_path / "it.c", plant, name="it") < 1e-9
     assert "void it_rest(const double *read, double *state);" in (tmp_path / "it.h").read_text()
@@ -365,7 +361,7 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
     twin, _ = ensemble(plant)
     twin.weights = {ALONE: 0.25, "late": 0.75}
     start, z = drawn(plant, 2)
-    controller = PredictiveControl(plant, twin.closure, PredictiveConfig(horizon=0.5, forecast="held"))
+    controller = rt.PredictiveControl(plant, twin.closure, rt.PredictiveConfig(horizon=0.5, forecast="held"))
     alone, late = (
         rt.control_cost(one.plant, controller.fly(one.plant.at_rest(start), z, one.closure, plant=one.plant))
         for one in (twin.twins[ALONE], twin.twins["late"])
@@ -377,7 +373,7 @@ def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
 def test_the_state_is_kept():
     """What goes on from it makes the same of the next record, in as many rounds."""
     twin, assimilation = ensemble(PLANT, call=0.05)
-    record, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    record, _ = recorded(rt.LaggedActuator(PLANT, "force", LAG))
     assimilation.update([record])
     assert assimilation.explain(0.06)
     other, resumed = ensemble(PLANT, call=0.05)
