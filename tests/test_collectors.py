@@ -8,11 +8,8 @@ from torchrl.collectors import Collector
 
 from rt_torchrl import PlantEnv, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
@@ -76,29 +73,29 @@ def test_every_entry_is_that_of_stepping(options):
     compare(lambda: system(LinearQuadratic(horizon=2.0), **options), (1.0, 0.5, 0.0), rtol=1e-12, atol=1e-13)
 
 
+def shortened(name):
+    """A shipped plant over 40 intervals."""
+    kind = shipped_plants()[name]
+    return kind(horizon=40 * kind().dt)
+
+
 @pytest.mark.parametrize("name", shipped_plants())
 def test_every_plant_flies_as_it_steps(name):
-    dt = shipped_plants()[name]().dt
-    # Rounding, amplified by the dynamics over 40 intervals.
-    compare(lambda: system(shipped_plants()[name](horizon=40 * dt)), rtol=1e-9, atol=1e-9)
+    # Rounding, amplified by the dynamics.
+    compare(lambda: system(shortened(name)), rtol=1e-9, atol=1e-9)
 
 
-CONTROLLERS = {
-    "cryogenic_tank": (CryogenicTank, PIValve),
-    "flapping_wing": (FlappingWing, TrimmedPD),
-    "wind_turbine": (WindTurbine, JonkmanController),
-}
+CONTROLLERS = {"cryogenic_tank": PIValve, "flapping_wing": TrimmedPD, "wind_turbine": JonkmanController}
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_controller_with_a_memory_flies_as_it_steps(name, noise):
-    kind, law = CONTROLLERS[name]
+    plant = shortened(name)
 
     def controlled():
-        plant = kind(horizon=40 * kind().dt)
         env, actor, _ = system(plant, noise=noise)
-        return env, actor, law(plant)
+        return env, actor, CONTROLLERS[name](plant)
 
     compare(controlled, (0.3, 0.0), rtol=1e-9, atol=1e-9)
 

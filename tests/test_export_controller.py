@@ -9,16 +9,7 @@ from c_build import library, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from seeds_and_numbers import double, seeded, stepped
 
-from rt_torchrl import (
-    LaggedActuator,
-    Rollout,
-    SaturatedAffine,
-    Signal,
-    StackedObservations,
-    export_controller,
-    export_twin,
-    shipped_plants,
-)
+import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.c_file import c_array
 from rt_torchrl.export.controller import Controller
@@ -48,7 +39,7 @@ class InC:
 
 def law(plant):
     """A policy that holds the turbine near its reference, so that speed and wind move all filters."""
-    policy = SaturatedAffine(len(plant.observations), plant.actions, generator=seeded(3))
+    policy = rt.SaturatedAffine(len(plant.observations), plant.actions, generator=seeded(3))
     with torch.no_grad():
         policy.linear.weight[:] = 0.0
         policy.linear.weight[:, :2] = torch.tensor([[1.0, 0.4], [0.6, 0.3]], dtype=torch.float64)
@@ -65,7 +56,7 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 50)
     plant = WindTurbine(observe=(observe,), horizon=150.0)
     policy = law(plant)
-    assert export_controller(policy, tmp_path / "turbine.c", plant, name="turbine") < CLOSE
+    assert rt.export_controller(policy, tmp_path / "turbine.c", plant, name="turbine") < CLOSE
     start, exogenous = plant.draw_initial_state(1, seeded(1)), plant.draw_exogenous(1, seeded(2))
     in_c = InC(tmp_path / "turbine.c", 2, len(plant.states) - 1, 2)
     in_c.start(start[0, 0].item(), exogenous[0, 0, 0].item())
@@ -92,16 +83,16 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     # The memory of the actuators is that of the plant; the filters differ by the curvature of the speed in an interval.
     found = torch.tensor(list(in_c.state.memory), dtype=torch.float64)
     torch.testing.assert_close(found[3:5], states[-2, 4:6], rtol=CLOSE, atol=CLOSE)
-    ideal = Rollout(plant, plant.closure, policy, engine="autograd")(start, exogenous).states[0].detach()
+    ideal = rt.Rollout(plant, plant.closure, policy, engine="autograd")(start, exogenous).states[0].detach()
     assert 1e-9 < ((states - ideal).abs() / size).max() < 2e-3
 
 
 @needs_compiler
 def test_a_controller_of_an_extended_plant_with_parameters(tmp_path):
     """The lag is the machine's and no part of the controller, which holds the last two observations."""
-    plant = StackedObservations(LaggedActuator(LinearQuadratic(), "force", 0.3), 2)
+    plant = rt.StackedObservations(rt.LaggedActuator(LinearQuadratic(), "force", 0.3), 2)
     policy = LinearGain([[1.0, 0.6, -0.3, 0.2, 0.1, -0.4]])
-    assert export_controller(policy, tmp_path / "stacked.c", plant, name="stacked") < CLOSE
+    assert rt.export_controller(policy, tmp_path / "stacked.c", plant, name="stacked") < CLOSE
     in_c = InC(tmp_path / "stacked.c", 1, 4, 2)
     start, exogenous = plant.draw_initial_state(1, seeded(1)), plant.draw_exogenous(1, seeded(2))
     in_c.start(*start[0, :2].tolist())
@@ -117,24 +108,6 @@ def test_a_controller_of_an_extended_plant_with_parameters(tmp_path):
     torch.testing.assert_close(actions[0], torch.stack(expected), rtol=0, atol=1e-12)
 
 
-def test_a_controller_state_that_depends_on_an_unknown_lag_is_refused(tmp_path):
-    class Summing(LinearQuadratic):
-        """With the integral of the force that acts, i."""
-
-        states = (*LinearQuadratic.states, Signal(symbol="i", name="impulse", unit="N s"))
-        controller_states = ("impulse",)
-
-        def vector_field(self, t, state, action, exogenous, closure):
-            return torch.cat([super().vector_field(t, state[..., :2], action, exogenous, closure), action], -1)
-
-        def observe(self, t, state, exogenous):
-            return state[..., 1:]
-
-    plant = LaggedActuator(Summing(), "force", 0.3)
-    with pytest.raises(ValueError, match=r"its states \(impulse\) depend on the closure"):
-        export_controller(LinearGain([[0.1, 0.2]]), tmp_path / "sum.c", plant)
-
-
 class Lagged(LinearQuadratic):
     """The oracle plant with a filter f of the position and an integral i of the time, which stand between the others.
 
@@ -142,11 +115,11 @@ class Lagged(LinearQuadratic):
     """
 
     states = (
-        Signal(symbol="f", name="filtered_position", unit="m"),
+        rt.Signal(symbol="f", name="filtered_position", unit="m"),
         *LinearQuadratic.states,
-        Signal(symbol="i", name="integral", unit="s"),
+        rt.Signal(symbol="i", name="integral", unit="s"),
     )
-    observations = tuple(Signal(symbol="e", name=f"e_{k}", unit="-") for k in range(4))
+    observations = tuple(rt.Signal(symbol="e", name=f"e_{k}", unit="-") for k in range(4))
     controller_states = ("integral", "filtered_position")
 
     def vector_field(self, t, state, action, exogenous, closure):
@@ -168,7 +141,7 @@ GAINS = [[0.4, 0.3, 0.2, 0.5]]
 @needs_compiler
 def test_filters_clock_and_order_of_the_states(tmp_path):
     """The filter of a straight line is known: f(t+h) = y₁ − r + (f − y₀ + r)e^{−h} with the slope r and h = Δt."""
-    assert export_controller(LinearGain(GAINS), tmp_path / "lag.c", Lagged(dt=0.1), name="lag") < CLOSE
+    assert rt.export_controller(LinearGain(GAINS), tmp_path / "lag.c", Lagged(dt=0.1), name="lag") < CLOSE
     in_c = InC(tmp_path / "lag.c", 1, 2, 2)
     positions = torch.cumsum(torch.randn(50, generator=seeded(), dtype=torch.float64), 0).tolist()
     in_c.start(positions[0], 0.0)
@@ -186,12 +159,12 @@ def test_filters_clock_and_order_of_the_states(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", shipped_plants().values())
+@pytest.mark.parametrize("kind", rt.shipped_plants().values())
 def test_controllers_of_the_plants(kind, tmp_path, monkeypatch):
     monkeypatch.setattr("rt_torchrl.export.c_controller.INTERVALS", 100)
     plant = kind()
     policy = plant.make_policy(seeded())
-    assert export_controller(policy, tmp_path / "it.c", plant, name="it") < CLOSE
+    assert rt.export_controller(policy, tmp_path / "it.c", plant, name="it") < CLOSE
     InC(tmp_path / "it.c", len(plant.actions), len(plant.controller_states), 9)  # without a warning
 
 
@@ -206,9 +179,29 @@ class Guessed(Lagged):
         return torch.cat([rates[..., :1] + closure(state[..., 1:3])[..., 1:], rates[..., 1:]], -1)
 
 
-def test_what_is_no_controller_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"integral, filtered_position\) depend on the closure"):
-        export_controller(LinearGain(GAINS), tmp_path / "it.c", Guessed(dt=0.1))
+class Summing(LinearQuadratic):
+    """A plant with the integral of the force that acts, i."""
+
+    states = (*LinearQuadratic.states, rt.Signal(symbol="i", name="impulse", unit="N s"))
+    controller_states = ("impulse",)
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return torch.cat([super().vector_field(t, state[..., :2], action, exogenous, closure), action], -1)
+
+    def observe(self, t, state, exogenous):
+        return state[..., 1:]
+
+
+@pytest.mark.parametrize(
+    ("plant", "gains", "states"),
+    [
+        (Guessed(dt=0.1), GAINS, "integral, filtered_position"),
+        (rt.LaggedActuator(Summing(), "force", 0.3), [[0.1, 0.2]], "impulse"),  # of which the lag is not known
+    ],
+)
+def test_what_is_no_controller_is_refused(plant, gains, states, tmp_path):
+    with pytest.raises(ValueError, match=rf"its states \({states}\) depend on the closure"):
+        rt.export_controller(LinearGain(gains), tmp_path / "it.c", plant)
     assert not list(tmp_path.iterdir())
 
 
@@ -217,7 +210,7 @@ def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
     right = CSource.text
     monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.25", "0.2500004"))
     with pytest.raises(ValueError, match="the controller it in C differs from the original"):
-        export_controller(LinearGain([[0.25, 1.0]]), tmp_path / "it.c", LinearQuadratic(), name="it")
+        rt.export_controller(LinearGain([[0.25, 1.0]]), tmp_path / "it.c", LinearQuadratic(), name="it")
     assert not list(tmp_path.iterdir())
 
 
@@ -225,12 +218,12 @@ def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.parametrize(("name", "kind"), [*((name, "own") for name in shipped_plants()), ("wind_turbine", "mlp")])
+@pytest.mark.parametrize(("name", "kind"), [*((name, "own") for name in rt.shipped_plants()), ("wind_turbine", "mlp")])
 def test_twins_of_the_plants(name, kind, tmp_path):
     """A flight in C, whose states are fed back, ends where the plant's own flight ends."""
-    plant = shipped_plants()[name]()
+    plant = rt.shipped_plants()[name]()
     closure = plant.make_closure(seeded()) if kind == "own" else plant.make_neural_closure(seeded(), (16, 16))
-    assert export_twin(closure, tmp_path / "twin.c", plant, name="twin") < CLOSE
+    assert rt.export_twin(closure, tmp_path / "twin.c", plant, name="twin") < CLOSE
     state, exogenous = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())[:, :50]
     middle = torch.tensor([[0.5 * (a.low + a.high) for a in plant.actions]], dtype=torch.float64)
     (expected,), *_ = stepped(plant, closure, state, exogenous, lambda *_: middle)
