@@ -1,4 +1,4 @@
-"""The table of results to hold: default trainings, unknown systems, and an identification, over several seeds.
+"""The table of results to hold: default trainings and unknown systems, over several seeds.
 
 ``uv run tests/ruler.py --seeds 5 --folder runs/ruler`` trains what is missing in the folder, two
 trainings side by side on one thread each, and prints the table as Markdown. The same command goes on where it was
@@ -70,15 +70,6 @@ def span(values: Sequence[float], digits: int = 5) -> str:
     return least if least == greatest else f"{least} … {greatest}"
 
 
-def identified(data: Path, folder: Path) -> float:
-    """RMS error of physics and perceptron on the Cascaded Tanks' test record [V]."""
-    results = folder / "results.json"
-    if not results.exists():
-        command = [sys.executable, str(RECIPES / "cascaded_tanks.py"), "--test", "--data", str(data)]
-        subprocess.run([*command, "--log-dir", str(folder)], check=True)
-    return json.loads(results.read_text())["physics and perceptron"]["test"]["rms"]
-
-
 class Result(NamedTuple):
     """What a training ended with: costs of the live and of the cheaper policy on unseen episodes, Σ, alarms, seconds.
 
@@ -116,7 +107,6 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("runs/ruler"))
     parser.add_argument("--rows", nargs="*", default=list(ROWS), choices=list(ROWS))
-    parser.add_argument("--tanks", type=Path, help="CSV file of the Cascaded Tanks; without it that row is left out")
     options = parser.parse_args()
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     tasks = {
@@ -132,9 +122,6 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for name in options.rows:
         print(line(name, [Result.of(tasks[name, seed]) for seed in seeds]))
-    if options.tanks:
-        rms = identified(options.tanks, options.folder / "cascaded_tanks")
-        print(f"\nCascaded Tanks: {rms:.4f} V")
 
 
 if __name__ == "__main__":
