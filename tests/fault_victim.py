@@ -8,32 +8,30 @@ from pathlib import Path
 
 from small_runs import FULL, small_run
 
-from rt_torchrl import Run, RunConfig
+from rt_torchrl import Run, RunConfig, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 EPISODES = 5
 QUICK = {"figures": False}
 SHIPPED = {
-    "wind_turbine": (lambda: WindTurbine(horizon=30.0), JonkmanController),
-    "flapping_wing": (lambda: FlappingWing(dt=0.002, horizon=0.12), TrimmedPD),
-    "cryogenic_tank": (lambda: CryogenicTank(horizon=1800.0), PIValve),
-    "pendulum": (lambda: Pendulum(horizon=3.0), None),
+    "wind_turbine": ({"horizon": 30.0}, JonkmanController),
+    "flapping_wing": ({"dt": 0.002, "horizon": 0.12}, TrimmedPD),
+    "cryogenic_tank": ({"horizon": 1800.0}, PIValve),
+    "pendulum": ({"horizon": 3.0}, None),
 }
 """The shipped plants with short episodes, each with the controller that the training begins with."""
 
 
 def shipped_run(name, folder, **options):
     """A training on a shipped plant that takes seconds."""
-    make_plant, controller = SHIPPED[name]
+    lengths, controller = SHIPPED[name]
     start = "random" if controller is None else "controller"
     shared = {"episodes": EPISODES, "unseen": 2, "start": start, "threads": 1, "twinning": FULL}
-    return Run(RunConfig(log_dir=folder, **shared | QUICK | options), make_plant(), first=controller)
+    return Run(
+        RunConfig(log_dir=folder, **shared | QUICK | options), shipped_plants()[name](**lengths), first=controller
+    )
 
 
 def victim(folder, options, kill_at=None, plant=None):

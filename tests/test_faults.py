@@ -10,11 +10,16 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_algorithm import twinning
 from test_classical import PD
 
-from rt_torchrl import FirstController, PlantEnv, RefereeConfig, Run, RunConfig, SafetyConfig, SafetyLayer
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl import (
+    FirstController,
+    PlantEnv,
+    RefereeConfig,
+    Run,
+    RunConfig,
+    SafetyConfig,
+    SafetyLayer,
+    shipped_plants,
+)
 from rt_torchrl.systems.sound_part import GREATEST
 
 DT, N = 0.1, 40
@@ -153,21 +158,16 @@ def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     assert [event.value for event in shown.Scalars("faults/not finite")] == [1.0]
 
 
-PLANTS = {
-    "pendulum": lambda: Pendulum(dt=0.05, horizon=0.05 * N),
-    "wind_turbine": lambda: WindTurbine(dt=0.25, horizon=0.25 * N),
-    "flapping_wing": lambda: FlappingWing(dt=0.002, horizon=0.002 * N),
-    "cryogenic_tank": lambda: CryogenicTank(dt=30.0, horizon=30.0 * N),
-}
+STEPS = {"pendulum": 0.05, "wind_turbine": 0.25, "flapping_wing": 0.002, "cryogenic_tank": 30.0}
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize(
     ("injection", "kind", "lost"), SENSORS + ACTUATORS + SYSTEMS, ids=lambda value: getattr(value, "kind", "")
 )
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", STEPS)
 def test_every_fault_is_survived_on_every_plant(name, injection, kind, lost):
-    plant = PLANTS[name]()
+    plant = shipped_plants()[name](dt=STEPS[name], horizon=STEPS[name] * N)
     layer = guarded(injection, plant=plant)
     found = twinning(plant, env=layer, hypotheses=SMALL.hypotheses)
     reports = [found.episode() for _ in range(3)]
