@@ -391,8 +391,8 @@ def test_a_fit_begins_anew_where_the_present_closure_diverges_and_the_first_one_
 def test_a_plan_that_no_flight_has_tried_does_not_stay_if_real_episodes_contradict_the_twin(right):
     plant = LinearQuadratic(horizon=2.0)
     closure = LinearClosure(plant.closure.matrix.detach() + (0.0 if right else 0.5))
-    referee = RefereeConfig(rule="expected_cost")
-    options = {"arm": "model_based", "referee": referee, "assimilation": AssimilationConfig(iterations=0)}
+    referee = rt.RefereeConfig(rule="expected_cost")
+    options = {"arm": "model_based", "referee": referee, "assimilation": rt.AssimilationConfig(iterations=0)}
     found = twinning(plant, closure=closure, **options)
     for _ in range(3):
         found.episode()

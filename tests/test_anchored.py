@@ -360,7 +360,7 @@ def test_the_best_that_flew_is_found_whatever_was_computed_before():
 def test_what_refuted_weights_counts_also_where_extreme_episodes_diverge():
     belief, refuted = belief_of([(0.5, 0.5)]), LinearGain([[0.5, 0.5]])
     belief.virtual.judge = lambda policy, episodes: (math.inf, 1.0)
-    judged = belief.judge(refuted, virtual_episodes(LinearQuadratic()))
+    judged = belief.judge(refuted, rt.Scenario(*drawn(LinearQuadratic(), 20, 99)))
     assert judged == (math.inf, belief.expected(refuted, 1.0), 1.0) and belief.expected(refuted, 1.0) > 1.1
 
 
@@ -383,7 +383,7 @@ def test_a_twin_that_diverges_within_an_interval_from_where_the_real_system_was_
     real = flight.trajectory.states[:, 0].abs().max().item()
     assert alone < real
     belief.require_sound_twin(episode)
-    walled = DigitalTwin(twin.plant, Walled(twin.closure.matrix.detach(), 0.5 * (alone + real)))
+    walled = rt.DigitalTwin(twin.plant, Walled(twin.closure.matrix.detach(), 0.5 * (alone + real)))
     belief = belief_of([(0.5, 0.5)], twin=walled)
-    with pytest.raises(DivergenceError, match="position is not finite"):
+    with pytest.raises(rt.DivergenceError, match="position is not finite"):
         belief.require_sound_twin(episode)
