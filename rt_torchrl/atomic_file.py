@@ -1,14 +1,14 @@
 """A file that is written whole or not at all."""
 
 import contextlib
-import dataclasses
 import json
-import math
 import os
 import secrets
 import time
 from pathlib import Path
 from typing import Any
+
+from pydantic_core import to_json, to_jsonable_python
 
 PARTIAL = ".partial"
 
@@ -31,13 +31,9 @@ def write_atomically(path: Path, content: bytes) -> None:
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-    _flush_folder(path.parent)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Put the names in a folder on the disk, so that a power cut does not bring an old name back."""
+    # The names in the folder go to the disk, too, so that a power cut does not bring an old name back.
     with contextlib.suppress(OSError):  # Windows opens no folder, and some file systems flush none
-        descriptor = os.open(folder, os.O_RDONLY)
+        descriptor = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
@@ -56,7 +52,7 @@ def write_json(path: Path, content: Any) -> Path:
     Raises:
         OSError: if the file cannot be written, see :func:`write_atomically`.
     """
-    write_atomically(path, (json.dumps(finite(content), indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(path, to_json(content, indent=2, inf_nan_mode="null") + b"\n")
     return path
 
 
@@ -77,15 +73,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def finite(content: Any) -> Any:
     """The content as JSON has it: None for every number that is not finite, text for paths, objects for dataclasses."""
-    if dataclasses.is_dataclass(content) and not isinstance(content, type):
-        return finite(dataclasses.asdict(content))
-    if isinstance(content, float):
-        return content if math.isfinite(content) else None
-    if isinstance(content, dict):
-        return {key: finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite(value) for value in content]
-    return str(content) if isinstance(content, Path) else content
+    return to_jsonable_python(content, inf_nan_mode="null")
 
 
 def make_folder(option: str, folder: Path) -> None:
