@@ -18,8 +18,8 @@ import rt_torchrl as rt
 from rt_torchrl.control.command_cost import CommandCost
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.runs.real_side import operation_of
 from rt_torchrl.runs.results import episode_record
+from rt_torchrl.runs.run_start import operation_of
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.interact import RealFlights

@@ -19,7 +19,7 @@ from test_real_system import Rig, connected
 
 from rt_torchrl import PlantEnv, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
-from rt_torchrl.runs.real_side import entries
+from rt_torchrl.runs.results import entries
 
 pytestmark = pytest.mark.training
 

@@ -11,7 +11,7 @@ from test_algorithm import flown as after
 from test_algorithm import twinning
 
 import rt_torchrl as rt
-from rt_torchrl.runs.real_side import simulated
+from rt_torchrl.runs.run_start import simulated
 from rt_torchrl.steps.switch import other_than
 
 LIMITS = rt.OperatingLimitsConfig(

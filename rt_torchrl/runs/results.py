@@ -1,8 +1,9 @@
-"""The results of a run in numbers, as ``metrics.json`` holds them."""
+"""The results of a run in numbers, as ``metrics.json`` holds them, with those of flights after the training."""
 
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,13 +18,15 @@ from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.runs.metrics import real_costs
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.metrics import read_metrics, real_costs
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.steps.switch import of_each_role
+from rt_torchrl.steps.switch import clones, of_each_role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 HIGH_CORRELATION = 0.9
@@ -280,3 +283,83 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
     for record in episodes:
         total.update(record["seconds"])
     return dict(total)
+
+
+def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Mapping[Role, nn.Module]) -> str:
+    """Why the live policy does not fly the real system after the training; empty if it does.
+
+    It does not where it still has the random weights that it began with, and where it may not act.
+
+    Args:
+        config: options of the run.
+        algorithm: the training at its end.
+        untrained: the policies before it.
+    """
+    live, interact = algorithm.referee.live, algorithm.steps["interact"]
+    policy = algorithm.policies[live]
+    if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
+        return f"{live} has its random initial weights"
+    return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
+
+
+def entries(
+    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
+) -> dict[str, Any]:
+    """The entry ``real_unseen`` of the summary, without J_p.
+
+    Where the live policy flew the same episodes as another controller, ``ratio`` is the mean of its costs over that of
+    the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
+
+    Args:
+        plant: plant of the real system.
+        flights: flights by the name of the controller.
+        judged: what these cost.
+        live: name of the live policy, which need not have flown.
+    """
+    controllers = {}
+    for name, judgement in judged.items():
+        controllers[name] = judgement.statistics()
+        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
+            controllers[name] |= compared(judged[live].control_costs, judgement.control_costs)
+    return {
+        "controllers": controllers,
+        "costs": {name: judgement.control_costs.tolist() for name, judgement in judged.items()},
+    }
+
+
+def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
+    """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
+    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
+        return False
+    for flights in zip(flown.each(), other.each(), strict=True):
+        inputs = [until_end(plant, flight).exogenous for flight in flights]
+        n = min(map(len, inputs))
+        if not torch.equal(inputs[0][:n], inputs[1][:n]):
+            return False
+    return True
+
+
+def judged_before(folder: Path, episodes: int, names: Iterable[str], count: int) -> dict[str, Any] | None:
+    """The entry that an earlier end of a run has left after as many episodes; None without.
+
+    Args:
+        folder: run folder.
+        episodes: number of episodes of the training.
+        names: names of the controllers that are to fly.
+        count: number of flights of each.
+    """
+    if not (folder / "metrics.json").is_file():
+        return None
+    metrics = read_metrics(folder)
+    entry: dict[str, Any] | None = metrics["summary"].get("real_unseen")
+    if entry is None or len(metrics["episodes"]) != episodes:
+        return None
+    flown = {name: controller["episodes"] for name, controller in entry["controllers"].items()}
+    return entry if flown == dict.fromkeys(names, count) else None
+
+
+def paid_before(folder: Path) -> list[float | None]:
+    """J_a of the flights that earlier ends of a resumed run have made; null stands for one that is not finite."""
+    if not (folder / "metrics.json").is_file():
+        return []
+    return list(read_metrics(folder)["summary"]["cost_of_learning"].get("judging", []))

@@ -23,12 +23,11 @@ from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, RealE
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs import real_side, results
+from rt_torchrl.runs import results, run_start
 from rt_torchrl.runs.command_line import quieten_libraries
 from rt_torchrl.runs.dashboard import Dashboard, Progress
 from rt_torchrl.runs.run_config import Callback, RunConfig, require_device
 from rt_torchrl.runs.run_folder import RunFolder, checkpoints, load_checkpoint, save_checkpoint, save_tensors
-from rt_torchrl.runs.run_start import known_physics, start_of
 from rt_torchrl.runs.settings import numbers_of
 from rt_torchrl.runs.table import next_steps, results_table
 from rt_torchrl.steps.config import ROLES, Role
@@ -40,7 +39,7 @@ from rt_torchrl.steps.start import EarlierPolicies, FirstController, first_live
 from rt_torchrl.steps.switch import DecisionTree, MakeReferee
 from rt_torchrl.systems.collectors import MakeCollector, collector_of
 from rt_torchrl.systems.operation import Operation
-from rt_torchrl.systems.preflight import check_record
+from rt_torchrl.systems.preflight import check_records
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory, until_end
 
@@ -110,12 +109,12 @@ class Run:
         self.callbacks = callbacks
         self.device = require_device(config.device)
         self._real = env if isinstance(env, RealSystem) or env is None else env()
-        physics = known_physics(config, plant, self._real, first, baselines).to(self.device)
+        physics = run_start.known_physics(config, plant, self._real, first, baselines).to(self.device)
         laws = dict(baselines or {})
         if begins == "controller" and first is not None and first not in laws.values():
             laws[first.__name__ if first.__name__ not in laws else f"{first.__name__} (first)"] = first
-        self._start = start_of(self.config, physics, first)
-        if threads := real_side.learner_threads(config):
+        self._start = run_start.start_of(self.config, physics, first)
+        if threads := run_start.learner_threads(config):
             torch.set_num_threads(threads)
         controllers = {name: law(physics) for name, law in laws.items()}
         flies_first = first if begins == "controller" else None
@@ -123,18 +122,18 @@ class Run:
         self._held = RunFolder(config, plant.name, {name: numbers_of(law) for name, law in named.items()})
         self.folder = self._held.path
         try:
-            simulated = functools.partial(real_side.simulated, plant, config, first, device=self.device)
+            simulated = functools.partial(run_start.simulated, plant, config, first, device=self.device)
             make_env, system = None if isinstance(env, RealSystem) else env or simulated, self._real or simulated()
             make_learner = learner or functools.partial(ActorCritic, replay=replay)
             self._system = system
             self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector)
-            self.unseen = real_side.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
+            self.unseen = run_start.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
             self.baselines = {name: law.to(self.device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
             self._paid: list[float | None] = []
             self._doubts: tuple[str, ...] = ()
             if config.resume and checkpoints(self.folder):
-                self._paid = real_side.paid_before(self.folder)
+                self._paid = results.paid_before(self.folder)
                 self.episodes = load_checkpoint(self.folder, self.algorithm)
                 self.started -= sum(results.seconds_per_step(self.episodes).values())
             elif self._real is not None and config.preflight:
@@ -165,7 +164,7 @@ class Run:
             first.hand_over(twin)
         learner = make_learner(physics, policies["model_free"], table.learner, generator=generator)
         if config.asynchronous:
-            env = real_side.operation_of(config, env, make_env, physics, policies, first=first)
+            env = run_start.operation_of(config, env, make_env, physics, policies, first=first)
         self.algorithm = ReinforcementTwinning(
             env,
             twin,
@@ -184,7 +183,7 @@ class Run:
 
     def _require_wiring(self, record: Trajectory) -> None:
         """Refuse a real system whose first flight shows a mistake in its wiring, and keep the doubts for the report."""
-        wiring = check_record(record, self.algorithm.twin.plant, self.initial_closure)
+        wiring = check_records([record], self.algorithm.twin.plant, self.initial_closure)
         wiring.require()
         self._doubts = wiring.doubts
 
@@ -306,10 +305,10 @@ class Run:
         if not count:
             return None
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
-        if reason := real_side.grounded(self.config, self.algorithm, self.initial_policies):
+        if reason := results.grounded(self.config, self.algorithm, self.initial_policies):
             bar.write(f"the live policy does not fly the real system: {reason}")
             del laws[live]
-        if earlier := real_side.judged_before(self.folder, len(self.episodes), laws, count):
+        if earlier := results.judged_before(self.folder, len(self.episodes), laws, count):
             bar.write("the real system has been flown after these episodes; it is not flown again")
             return earlier
         if interrupted:
@@ -328,7 +327,7 @@ class Run:
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        entry = real_side.entries(episodes.plant, flights, judged, live)
+        entry = results.entries(episodes.plant, flights, judged, live)
         self._paid += [cost for costs in entry["costs"].values() for cost in costs]
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])

@@ -1,24 +1,34 @@
-"""What a run begins with: a plant, controllers and options that go together, and what the option ``start`` names."""
+"""What a run begins with: plant, controllers and options that go together, its start, and its real system."""
 
+import os
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
+from torch import nn
+from torchrl.envs import EnvBase
 
 from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Baseline, RealController
+from rt_torchrl.evaluation.unseen import Baseline, RealController, TwinEpisodes, UnseenEpisodes
 from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig, require_plant
 from rt_torchrl.runs.run_folder import checkpoints
-from rt_torchrl.steps.config import ROLES
+from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.hypotheses.ensemble import TwinEnsemble, make_twin
 from rt_torchrl.steps.start import EarlierPolicies, FirstController, RecordedFlights, Start
-from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.config import SafetyConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.operation import FIRST, Operation, Operator
+from rt_torchrl.systems.real_system import RealSystem, episode_seed
+from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
 from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> Start | None:
@@ -174,3 +184,94 @@ def _require_simulation(config: RunConfig, env: RealSystem | None, baselines: di
 
 def _acts_on_the_real_system(law: object) -> bool:
     return isinstance(law, type) and issubclass(law, RealController)
+
+
+def simulated(
+    plant: Plant, config: RunConfig, first: type[ClassicalController] | None, *, device: torch.device
+) -> EnvBase:
+    """The real system in simulation, with the sensors of the configuration.
+
+    With limits it is behind a safety layer, whose fallback is the controller that the real system has had so far, or
+    the action nearest to zero within the limits.
+    """
+    env = PlantEnv(plant, seed=config.seed, device=device, noise=config.noise)
+    if not config.twinning.limits:
+        return env
+    limits = OperatingLimits(plant, config.twinning.limits)
+    config_of_layer = SafetyConfig(interval=plant.dt, **limits.safety())
+    if first is not None:
+        return SafetyLayer(env, config_of_layer, fallback=first(plant).to(device))
+    space = env.action_spec.space
+    ends = zip(*limits.actions, space.low.flatten().tolist(), space.high.flatten().tolist(), strict=True)
+    rest = [min(max(0.0, low, least), high, greatest) for low, high, least, greatest in ends]
+    return SafetyLayer(env, config_of_layer, fallback=rest)
+
+
+def judged_on(
+    plant: Plant, twin: DigitalTwin, env: RealSystem | None, config: RunConfig, *, device: torch.device
+) -> UnseenEpisodes:
+    """The unseen episodes, for which no real system moves: on the plant, or on the twin if nobody knows the closure.
+
+    Policies for them are made for the physics that the twin knows, and leaving the bounds of states counts.
+    """
+    if env is None:
+        unseen = UnseenEpisodes(plant, config.unseen, device=device)
+        beside = {"noise of the sensors": config.noise, "the safety layer": config.twinning.limits}
+        if left_out := " and ".join(what for what, there in beside.items() if there):
+            unseen.judged_on = f"simulation without {left_out}"  # with which real_unseen flies
+    elif env.closure is not None:
+        unseen = UnseenEpisodes(plant, config.unseen, device=device)
+        unseen.closure, unseen.judged_on = env.closure, "simulation of the real system"
+    else:
+        unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
+    unseen.physics, unseen.bounds = twin.plant, StateBounds(plant.readings, config.twinning.limits.states)
+    return unseen
+
+
+NOISE = 2**20
+"""Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
+
+
+def learner_threads(config: RunConfig) -> int:
+    """Number of CPU threads of the learner; 0 leaves torch's default.
+
+    Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
+    """
+    if config.threads or not config.asynchronous:
+        return config.threads
+    return min(torch.get_num_threads(), max(1, (os.cpu_count() or 1) - 1))
+
+
+def operation_of(
+    config: RunConfig,
+    env: EnvBase,
+    make_env: Callable[[], EnvBase] | None,
+    plant: Plant,
+    policies: Mapping[Role, nn.Module],
+    *,
+    first: Start | None = None,
+) -> Operation:
+    """The operation of a run.
+
+    Args:
+        config: options of the run.
+        env: the real system.
+        make_env: function that makes the real system in another process; None if there is none.
+        plant: physics of the twin.
+        policies: both policies by role.
+        first: what the training begins with, whose teacher may act, too.
+
+    Raises:
+        ValueError: if one of these does not allow it, or :class:`Operation` raises it.
+    """
+    if plant.end_cost is not None or make_env is None or config.device != "cpu":
+        raise ValueError(
+            "asynchronous needs a function that makes the real system in another process, Run(..., env=), episodes "
+            f"that do not end early, and the CPU; here device={config.device!r}, and the plant is {plant.name!r}."
+        )
+    acting: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
+    if first is not None and first.teacher is not None:
+        acting[FIRST] = first.teacher
+    seed = episode_seed(config.seed, NOISE)
+    operator = Operator(make_env, plant, acting, config.twinning.exploration, config.operation, seed=seed)
+    return Operation(operator, env)

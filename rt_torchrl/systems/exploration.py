@@ -15,6 +15,8 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 OF_RANDOM_WEIGHTS, OF_IMITATIONS = 0.2, 0.02
 """Spread of the noise around random weights, and around policies that imitate a controller."""
+HANDOVER = 20
+"""Number n of control intervals in which an offset of a handover as wide as the range of the action fades."""
 
 
 @configuration
@@ -149,21 +151,12 @@ class BumplessPolicy(LivePolicy):
         plant: plant that gives the ranges of the actions and the control interval.
         policy: the policy that is live.
         config: parameters of the noise.
-        intervals: number n of control intervals in which an offset as wide as the whole range fades.
         generator: source of the noise.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        policy: nn.Module,
-        config: ExplorationConfig,
-        *,
-        intervals: int,
-        generator: torch.Generator,
-    ):
+    def __init__(self, plant: Plant, policy: nn.Module, config: ExplorationConfig, *, generator: torch.Generator):
         super().__init__(plant, policy, config, generator=generator)
-        self._share = (self.high - self.low) / intervals
+        self._share = (self.high - self.low) / HANDOVER
         self._former: nn.Module | None = None
         self._offset: Tensor | None = None
 

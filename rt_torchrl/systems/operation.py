@@ -36,8 +36,6 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 FIRST: Final = "first"
 """Name of the policy or state feedback that acts before the trained policies do."""
-HANDOVER = 20
-"""Number of control intervals in which an offset of a handover as wide as the range of the action fades."""
 LOOK = 0.1
 """Time after which the learner looks again whether Ctrl-C was pressed while it waits for a window [s]."""
 END = 10.0
@@ -181,7 +179,7 @@ class Operator:
         self._order: Order
         generator, first = torch.Generator(device=self.env.device), next(iter(self.policies.values()))
         generator.manual_seed(self.seed)
-        self.actor = BumplessPolicy(self.plant, first, self.exploration, intervals=HANDOVER, generator=generator)
+        self.actor = BumplessPolicy(self.plant, first, self.exploration, generator=generator)
         pace: Pace | None = getattr(self.env, "pace", None)
         self._keeps_time = pace is None
         self.pace = Pace(self.plant.dt / self.config.speed) if pace is None else pace

@@ -104,10 +104,14 @@ class Flown(NamedTuple):
 
 
 class Unexplained(NamedTuple):
-    """The share of each state's movement that predictions leave unexplained, and their RMS error in its unit."""
+    """The share of each state's movement that predictions leave unexplained, and their RMS error in its unit.
+
+    ``noise`` says where the errors of neighbouring intervals alternate, as those by noise of a sensor do.
+    """
 
     share: Float[Tensor, " n_s"]
     error: Float[Tensor, " n_s"]
+    noise: Bool[Tensor, " n_s"]
 
     @property
     def score(self) -> float:
@@ -138,7 +142,7 @@ class Wiring(NamedTuple):
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
-        columns = (self.moved, *self.present, self.noise)
+        columns = (self.moved, self.present.share, self.present.error, self.noise)
         for signal, moved, share, error, noise in zip(self.plant.states, *columns, strict=True):
             explained = f"{100.0 * share:.3g} % unexplained" if share.isfinite() else "it does not move"
             explained += ", which is noise of its sensor" if noise else ""
@@ -210,12 +214,7 @@ def check_real_system(
         env.load_state_dict(kept)
     if not parts:
         raise WiringError("every reading of the first flights was refused by the safety layer; see its events.")
-    return _checked(parts, plant, closure)
-
-
-def check_record(record: Trajectory, plant: Plant, closure: nn.Module) -> Wiring:
-    """The same of a flight that has been flown, such as the first one of a training."""
-    return _checked([record], plant, closure)
+    return check_records(parts, plant, closure)
 
 
 def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
@@ -237,7 +236,8 @@ def _windows(records: Sequence[Trajectory], plant: Plant, length: int) -> Flown:
     return Flown(t, states, actions, exogenous, ends, earlier)
 
 
-def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) -> Wiring:
+def check_records(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) -> Wiring:
+    """The same of flights that have been flown, such as the first one of a training."""
     fit, flown = _Fit(copy.deepcopy(plant).cpu(), closure), _windows(records, plant, 1)
     present, (moved, moves) = fit.unexplained(flown), fit.movement(flown)
     explained, noise, share = not (present.share > EXPLAINED).any(), torch.zeros_like(moves), present.share
@@ -251,7 +251,7 @@ def _checked(records: Sequence[Trajectory], plant: Plant, closure: nn.Module) ->
     if not mistakes and not explained:
         early = flown.t < (EARLY - 0.5) * plant.dt
         first = flown._replace(**{name: getattr(flown, name)[early] for name in Flown._fields[:6]})
-        noise = fit.noise(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1))
+        noise = fit.unexplained(_windows([record.part(0, ROWS, plant.dt) for record in records], plant, 1)).noise
         likely: list[str] = []
         # More coefficients than readings would explain anything, and noise leaves nothing that is explained wholly.
         if first.ends.numel() > len(fit.guess) and not noise.any():
@@ -366,24 +366,13 @@ class _Fit:
 
     def unexplained(self, flown: Flown, evaluations: int = EVALUATIONS) -> Unexplained:
         """What is left with the coefficients that fit best after so many evaluations."""
-        return self._left(flown, self._least_errors(flown, evaluations))
-
-    def _left(self, flown: Flown, errors: Float[Tensor, "n n_s"]) -> Unexplained:
+        errors, _ = self._errors(flown, self._fitted(flown, evaluations) if self._weights else self.guess)
         error, (size, moves) = errors.square().mean(0), self.movement(flown)
         share = torch.where(moves, (error / size**2).nan_to_num(WORST, WORST).clamp(max=WORST), torch.nan)
-        return Unexplained(share, error.sqrt())
-
-    def _least_errors(self, flown: Flown, evaluations: int) -> Float[Tensor, "n n_s"]:
-        weights = self._fitted(flown, evaluations) if self._weights else self.guess
-        return self._errors(flown, weights)[0]
-
-    def noise(self, flown: Flown) -> Bool[Tensor, " n_s"]:
-        """Whether the errors of a state in neighbouring intervals alternate, as those by noise of its sensor do."""
-        errors = self._least_errors(flown, EVALUATIONS)
         neighbours = (flown.t.diff() - self.plant.dt).abs() < 0.5 * self.plant.dt
-        alike = (errors[1:] * errors[:-1])[neighbours].mean(0) / errors.square().mean(0)
+        alike = (errors[1:] * errors[:-1])[neighbours].mean(0) / error
         beyond = -ALTERNATING / max(1, int(neighbours.sum())) ** 0.5
-        return (self._left(flown, errors).share > EXPLAINED) & (alike < beyond)
+        return Unexplained(share, error.sqrt(), (share > EXPLAINED) & (alike < beyond))
 
     def movement(self, flown: Flown) -> tuple[Float[Tensor, " n_s"], Bool[Tensor, " n_s"]]:
         """RMS movement of each state, and whether the state moves at all."""
