@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 
-TOLERANCE = 1e-6
-"""Greatest difference of a policy, as a share of the action's range; computation in double precision needs 1e-12."""
 OBSERVATIONS = 1000
 SEED = 20_250_131
 """Seed of the observations, which is the same for every export and is used in no training."""
@@ -72,35 +70,6 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
             "the observation alone can be exported."
         )
     return policy
-
-
-@torch.no_grad()
-def require_policy(
-    policy: nn.Module, exported: Callable[[Float[Tensor, "n n_o"]], Tensor], plant: Plant, what: str
-) -> float:
-    """Compare an export with its policy on random observations, one, two and many at a time.
-
-    Args:
-        policy: the original policy.
-        exported: function that computes what a user of the exported file would compute.
-        plant: plant with the observations and the ranges of the actions.
-        what: name of the exported thing, for the message.
-
-    Returns:
-        Greatest difference of an action, as a share of its range or, for an action without range, of its greatest size.
-
-    Raises:
-        ValueError: if the difference exceeds ``TOLERANCE``, or the policy's actions are not finite.
-    """
-    observations, what = (
-        sample_observations(plant.observations, OBSERVATIONS),
-        f"{what} of policy {type(policy).__name__}",
-    )
-    expected = policy(observations)
-    if not expected.isfinite().all():
-        raise ValueError(f"{what} gives actions that are not finite.")
-    actions = torch.cat([exported(part) for part in observations.split([1, 2, OBSERVATIONS - 3])])
-    return require_close(actions, expected, action_sizes(plant, expected), TOLERANCE, plant.actions, what)
 
 
 def action_sizes(plant: Plant, actions: Float[Tensor, "n n_a"]) -> Float[Tensor, " n_a"]:

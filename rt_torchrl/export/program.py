@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.export.agreement import detached, require_policy, sample_observations
+from rt_torchrl.export.agreement import OBSERVATIONS, action_sizes, detached, require_close, sample_observations
 from rt_torchrl.loading import of_extra
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 INTERFACE = "interface.json"
 """Name of the metadata of a model that describes observations and actions."""
+TOLERANCE = 1e-6
+"""Greatest difference of an action, as a share of its range; computation in double precision needs 1e-12."""
 
 
 def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
@@ -41,7 +43,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
             form, onnxruntime cannot run the model, or the model does not agree with the policy.
     """
     onnxruntime = [of_extra(package, "export") for package in ("onnx", "onnxscript", "onnxruntime")][-1]
-    policy = detached(policy, plant)
+    policy, name = detached(policy, plant), type(policy).__name__
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of a missing torchvision
     options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
     try:
@@ -61,7 +63,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     except Exception as error:  # torch.export, its exporter and onnxruntime raise many kinds, of several modules
         raise ValueError(
-            f"policy {type(policy).__name__} has no ONNX form that onnxruntime runs in double precision: "
+            f"policy {name} has no ONNX form that onnxruntime runs in double precision: "
             f"{str(error).strip()}. Write branches on values as torch.where, and sizes so that any batch can be "
             "passed, or use C."
         ) from error
@@ -69,7 +71,12 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     def run(rows: Tensor) -> Tensor:
         return torch.from_numpy(session.run(["action"], {"observation": rows.numpy()})[0])
 
-    difference = require_policy(policy, run, plant, "the ONNX model")
+    observations, what = sample_observations(plant.observations, OBSERVATIONS), f"the ONNX model of policy {name}"
+    expected = policy(observations)
+    if not expected.isfinite().all():
+        raise ValueError(f"{what} gives actions that are not finite.")
+    actions = torch.cat([run(part) for part in observations.split([1, 2, OBSERVATIONS - 3])])  # any batch
+    difference = require_close(actions, expected, action_sizes(plant, expected), TOLERANCE, plant.actions, what)
     write_atomically(Path(path), content)
     return difference
 

@@ -124,9 +124,9 @@ class Run:
         try:
             simulated = functools.partial(run_start.simulated, plant, config, first, device=self.device)
             make_env, system = None if isinstance(env, RealSystem) else env or simulated, self._real or simulated()
-            make_learner = learner or functools.partial(ActorCritic, replay=replay)
-            self._system = system
-            self._make_algorithm(system, make_env, physics, (make_learner, planner, referee), collector)
+            self._system, make_learner = system, learner or functools.partial(ActorCritic, replay=replay)
+            self._makers = make_learner, planner, referee, collector
+            self._make_algorithm(system, make_env, physics)
             self.unseen = run_start.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
             self.baselines = {name: law.to(self.device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
@@ -142,15 +142,8 @@ class Run:
             self._held.release()
             raise
 
-    def _make_algorithm(
-        self,
-        env: EnvBase | Operation,
-        make_env: Callable[[], EnvBase] | None,
-        physics: Plant,
-        makers: tuple[Callable[..., Learner], MakePlanner, MakeReferee],
-        collector: MakeCollector,
-    ) -> None:
-        config, (make_learner, planner, referee) = self.config, makers
+    def _make_algorithm(self, env: EnvBase | Operation, make_env: Callable[[], EnvBase] | None, physics: Plant) -> None:
+        config, (make_learner, planner, referee, collector) = self.config, self._makers
         generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, physics)
         policies = {role: policy.to(self.device) for role, policy in config.make_policies(physics, generator).items()}
@@ -244,8 +237,13 @@ class Run:
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
             real = self._fly_the_real_system(bar)
-            checks = {"engine_gap": gap, "recalled": recalled}
-            metrics = self._results(checks, flights, judged, real, time.perf_counter() - began)
+            judging = time.perf_counter() - began
+            summary = results.summarise(
+                self.algorithm, self.unseen, flights, judged, self.initial_policies, self.initial_closure
+            )
+            summary |= {"engine_gap": gap, "recalled": recalled, "ended": self.ended}
+            summary |= {} if real is None else {"real_unseen": real}
+            metrics = self._written(summary, judged, judging)
             if self.config.figures:
                 bar.doing("drawing the figures")
                 dashboard.images(self._drawn(flights, judged), len(self.episodes))
@@ -334,24 +332,13 @@ class Run:
             entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}
         return entry
 
-    def _results(
-        self,
-        checks: dict[str, float],
-        flights: dict[str, Trajectory],
-        judged: dict[str, Judged],
-        real: dict[str, Any] | None,
-        judging: float,
-    ) -> dict[str, Any]:
-        parts = self.initial_policies, self.initial_closure
-        summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
-        if real is not None:
-            summary["real_unseen"] = real
+    def _written(self, summary: dict[str, Any], judged: Mapping[str, Judged], judging: float) -> dict[str, Any]:
+        """Write ``weights.pt`` and ``metrics.json``, whose content is returned."""
         summary["cost_of_learning"] = results.cost_of_learning(self.episodes, self._paid)
         if self.config.reference:
             best, better = exact_optimum(self.unseen, self.make_policy), judged[summary["better"]].control_costs.mean()
             summary["reference"] = {"J_a": best.cost, "J_a_by_gradients": best.by_gradients}
             summary["reference"]["better_over_reference"] = better.item() / best.cost
-        summary |= {**checks, "ended": self.ended}
         total, seconds = time.perf_counter() - self.started, results.seconds_per_step(self.episodes)
         seconds["judge"] = judging
         summary["seconds"] = seconds | {"rest": total - sum(seconds.values()), "total": total}
