@@ -16,7 +16,7 @@ from rt_torchrl.contract.check import require_controller
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.export.controller import Controller
+from rt_torchrl.export.c_controller import Controller
 from rt_torchrl.trajectories.state_feedback import Remembering
 
 N_G = 97.0

@@ -11,8 +11,8 @@ from seeds_and_numbers import double, seeded, stepped
 
 import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export.c_controller import Controller
 from rt_torchrl.export.c_file import c_array
-from rt_torchrl.export.controller import Controller
 from rt_torchrl.programs.c_source import CSource
 
 CLOSE = 1e-9

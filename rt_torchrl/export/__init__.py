@@ -4,7 +4,7 @@ Before a file is written, it is compared with what it was made of, see :mod:`.ag
 """
 
 from rt_torchrl.export.c_controller import export_controller
-from rt_torchrl.export.c_function import export_c, export_twin
+from rt_torchrl.export.c_file import export_c, export_twin
 from rt_torchrl.export.program import export_onnx
 
 __all__ = ["export_c", "export_controller", "export_onnx", "export_twin"]

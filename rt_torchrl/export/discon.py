@@ -12,9 +12,8 @@ from torch import nn
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached
-from rt_torchrl.export.c_controller import CController
+from rt_torchrl.export.c_controller import CController, Controller
 from rt_torchrl.export.c_file import STRICT, compile_c, compiler, require_names
-from rt_torchrl.export.controller import Controller
 from rt_torchrl.export.fmu import SUFFIXES
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import place_of

@@ -16,8 +16,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.export.c_file import compile_c, compiler
-from rt_torchrl.export.c_function import export_c, export_twin
+from rt_torchrl.export.c_file import compile_c, compiler, export_c, export_twin
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 

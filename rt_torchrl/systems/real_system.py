@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 
-from rt_torchrl.export.controller import Controller
+from rt_torchrl.export.c_controller import Controller
 from rt_torchrl.options import array_of
 from rt_torchrl.plants.plant import Plant, replaying
 from rt_torchrl.plants.signal import Signal
