@@ -220,11 +220,9 @@ class RunConfig:
         if self.start not in (None, "random"):
             twinning = dataclasses.replace(twinning, exploration=twinning.exploration.imitating())
         if self.quick:
-            iterations = {
-                name: min(getattr(twinning.learner, name), QUICK_ITERATIONS)
-                for name in ("critic_iterations", "actor_iterations")
-            }
-            twinning = dataclasses.replace(twinning, learner=dataclasses.replace(twinning.learner, **iterations))
+            learner, names = twinning.learner, ("critic_iterations", "actor_iterations")
+            iterations = {name: min(getattr(learner, name), QUICK_ITERATIONS) for name in names}
+            twinning = dataclasses.replace(twinning, learner=dataclasses.replace(learner, **iterations))
             greatest = {"episodes": QUICK_EPISODES, "unseen": QUICK_UNSEEN, "real_unseen": QUICK_UNSEEN}
             least = {name: min(getattr(self, name), number) for name, number in greatest.items()}
         return dataclasses.replace(self, quick=False, twinning=twinning, **least)

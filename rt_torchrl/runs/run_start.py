@@ -132,7 +132,21 @@ def known_physics(
             states that no sensor of the real system reads, or lacks some that one reads.
     """
     require_plant("plant", plant)
-    _require_simulation(config, real, baselines)
+    unknown = real is not None and real.closure is None
+    laws: dict[str, object] = dict(baselines or {})
+    flown = [name for name, law in laws.items() if isinstance(law, type) and issubclass(law, RealController)]
+    if real is not None and config.noise:
+        raise ValueError(f"noise={config.noise} needs a plant in simulation; this run has a real system.")
+    if flown and not (unknown and config.real_unseen):
+        raise ValueError(
+            f"baselines {flown} can only be flown on the real system: give a RealSystem without its closure, and "
+            "real_unseen, the number of episodes that each may fly, or leave them out."
+        )
+    if unknown and config.reference:
+        raise ValueError(
+            f"reference={config.reference} is computed on the plant under the true closure, and the real system's is "
+            "not known; leave it out, or give the RealSystem its closure."
+        )
     believed = config.believed()
     physics = plant if believed is None else believed
     require_plant("config.believed()", physics)
@@ -153,37 +167,10 @@ def known_physics(
             stacklevel=3,
         )
     controllers: dict[str, object] = {} if first is None else {"first": first}
-    controllers |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
+    controllers |= {f"baselines[{name!r}]": law for name, law in laws.items() if name not in flown}
     for name, law in controllers.items():
-        if not _acts_on_the_real_system(law):
-            require_controller(name, law, physics)
+        require_controller(name, law, physics)
     return physics
-
-
-def _require_simulation(config: RunConfig, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None) -> None:
-    """Refuse options and controllers that need the other kind of system: a plant in simulation, or a real one.
-
-    Raises:
-        ValueError: if there is such an option or controller; it names it.
-    """
-    unknown = env is not None and env.closure is None
-    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
-    if env is not None and config.noise:
-        raise ValueError(f"noise={config.noise} needs a plant in simulation; this run has a real system.")
-    if real and not (unknown and config.real_unseen):
-        raise ValueError(
-            f"baselines {real} can only be flown on the real system: give a RealSystem without its closure, and "
-            "real_unseen, the number of episodes that each may fly, or leave them out."
-        )
-    if unknown and config.reference:
-        raise ValueError(
-            f"reference={config.reference} is computed on the plant under the true closure, and the real system's is "
-            "not known; leave it out, or give the RealSystem its closure."
-        )
-
-
-def _acts_on_the_real_system(law: object) -> bool:
-    return isinstance(law, type) and issubclass(law, RealController)
 
 
 def simulated(

@@ -45,7 +45,7 @@ class SafetyConfig:
     interval: Positive
     low: tuple[Unbounded, ...] | None = None
     high: tuple[Unbounded, ...] | None = None
-    rates: tuple[Unbounded, ...] | None = None
+    rates: tuple[Limit, ...] | None = None
     ranges: Mapping[str, Range] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     frozen: Mapping[str, Count] = field(default_factory=dict)

@@ -18,7 +18,6 @@ from torchrl.envs import EnvBase
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.options import array_of, other_units, require_range
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
 from rt_torchrl.systems.environment import AroundSystem, layers
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -32,7 +31,6 @@ SLACK = 1e-6
 """Slack in comparisons of times that are sums of many intervals, as a share of an interval."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor] | StateFeedback
-Ends = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class SafetyEvent(NamedTuple):
@@ -74,7 +72,7 @@ class ActionLimits:
         config: range and rates of the actions, and the control interval Δt.
 
     Raises:
-        ValueError: if a number does not fit the actions, the range is empty, or a rate is not positive.
+        ValueError: if a number does not fit the actions, or the range is empty.
     """
 
     def __init__(self, spec: TensorSpec, config: SafetyConfig):
@@ -84,17 +82,15 @@ class ActionLimits:
         if not ((self.low <= self.high) & (self.low < math.inf) & (self.high > -math.inf)).all():
             raise ValueError(f"low={low} and high={high} leave no action of the system's own range {spec.space}.")
         self._increment = None if config.rates is None else config.interval * self.constant("rates", config.rates)
-        if self._increment is not None and not (self._increment > 0.0).all():
-            raise ValueError(f"rates={config.rates} must be positive; infinity does not limit an action.")
 
     def constant(self, argument: str, values: Sequence[float]) -> Tensor:
         """The action of these values, one number for each component.
 
         Raises:
-            ValueError: if the values are too many or too few, or one is NaN.
+            ValueError: if the values are too many or too few.
         """
         action = torch.as_tensor(array_of(argument, values), dtype=self.spec.dtype, device=self.spec.device)
-        if action.shape != self.spec.shape[-1:] or action.isnan().any():
+        if action.shape != self.spec.shape[-1:]:
             raise ValueError(f"{argument}={values} must have {self.spec.shape[-1]} numbers, one for each action.")
         return action.expand(self.spec.shape)
 
@@ -409,7 +405,11 @@ class OperatingLimits:
                     ends, low, high, unit = (ends,), 0.0, (high - low) / plant.dt, f"{unit}/s"
                 for end in filter(math.isfinite, ends):
                     require_range(f"limits.{what} {name}", end, low, high, unit=unit, of="the plant")
-        self.states, self.actions = _ends(plant.readings, config.states), _ends(plant.actions, config.actions)
+        free = (-math.inf, math.inf)
+        self.states, self.actions = (
+            tuple(tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
+            for signals, given in ((plant.readings, config.states), (plant.actions, config.actions))
+        )
         self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
 
     def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
@@ -443,9 +443,3 @@ def _outside(values: Tensor, ends: Range) -> Bool[Tensor, "*batch n"]:
     """Where values do not lie between their ends, as NaN never does."""
     low, high = (torch.as_tensor(end, dtype=values.dtype, device=values.device) for end in ends)
     return ~((values >= low) & (values <= high))
-
-
-def _ends(signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> Ends:
-    free = (-math.inf, math.inf)
-    low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
-    return low, high

@@ -18,12 +18,10 @@ CONNECT = 4.0
 FORMATS = {"SByte": "b", "Byte": "B", "Int16": "h", "UInt16": "H", "Int32": "i", "UInt32": "I", "Int64": "q"}
 FORMATS |= {"UInt64": "Q", "Float": "f", "Double": "d"}
 """Formats of ``struct`` of the types of numbers."""
-PASSING = frozenset(
-    {
-        *("BadNoCommunication", "BadCommunicationError", "BadNotConnected", "BadServerNotConnected", "BadTimeout"),
-        *("BadWaitingForInitialData", "BadServerHalted", "BadShutdown", "BadOutOfService"),
-    }
-)
+PASSING = (
+    "BadNoCommunication BadCommunicationError BadNotConnected BadServerNotConnected BadTimeout "
+    "BadWaitingForInitialData BadServerHalted BadShutdown BadOutOfService"
+).split()
 """Answers to a command that say that the machine behind the server is not there now; they do not refuse the command."""
 UNTOLD = ("BadAttributeIdInvalid", "BadUserAccessDenied", "BadNotReadable")
 """Answers of a server that does not tell the type of a node; a double is written there."""
