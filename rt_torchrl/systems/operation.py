@@ -389,12 +389,12 @@ class Operation:
         while not connection.poll(LOOK):
             safe_point()
         try:
-            kind, *parts = pickle.loads(connection.recv_bytes())
+            message = pickle.loads(connection.recv_bytes())
         except (EOFError, OSError) as error:
             raise RuntimeError("the acting process has ended without a word; it may have been killed.") from error
-        if kind == "failed":
-            raise RuntimeError(f"the acting process has failed: {parts[0]}")
-        window, state = parts
+        if isinstance(message, str):
+            raise RuntimeError(f"the acting process has failed: {message}")
+        window, state = message
         self._state = state
         self.system.load_state_dict(state["env"])
         return self._take(window, state["order"]["version"])
@@ -472,7 +472,7 @@ def act(connection: Connection, pickled: bytes, state: bytes | None) -> None:
         threading.Thread(target=_receive, args=(connection, orders, operator.policies), daemon=True).start()
         _operate(operator, None if state is None else pickle.loads(state), orders, windows)
     except BaseException as error:  # any error goes to the learner, because nobody sees this one
-        windows.put(("failed", f"{type(error).__name__}: {error}"))
+        windows.put(f"{type(error).__name__}: {error}")
     windows.put(None)
     sender.join()
 
@@ -501,7 +501,7 @@ def _operate(
         gc.freeze()  # a collection of all objects that the libraries have made would stop an action
         while True:
             window = operator.window(receive)
-            windows.put(("window", window, operator.state_dict()))
+            windows.put((window, operator.state_dict()))
     except _Stopped:
         return
     finally:
@@ -525,8 +525,7 @@ def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[st
 def _send(connection: Connection, windows: SimpleQueue[Any]) -> None:
     with contextlib.suppress(OSError):  # of a learner that has gone
         while (message := windows.get()) is not None:
-            kind, *parts = message
-            if kind == "window":  # whose stack takes long, and would keep the control loop waiting
-                window, state = parts
-                parts = [window._replace(entries=together(window.entries)), state]
-            connection.send_bytes(pickle.dumps((kind, *parts)))
+            if not isinstance(message, str):  # a window, whose stack takes long and would keep the control loop waiting
+                window, state = message
+                message = window._replace(entries=together(window.entries)), state
+            connection.send_bytes(pickle.dumps(message))
