@@ -256,7 +256,15 @@ def load_run(
             part.load_state_dict(weights[role])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
-    twin = _twin(folder, config, physics, closure, weights.get("hypotheses"))
+    twin = DigitalTwin(physics, closure)
+    if "hypotheses" in weights:
+        twin = make_twin(physics, closure, config.twinning.hypotheses)
+        try:
+            if not isinstance(twin, TwinEnsemble):
+                raise ValueError(f"plant {physics.name!r} suspects nothing any more.")
+            twin.load_hypotheses(weights["hypotheses"])
+        except ValueError as error:
+            raise ValueError(f"the hypotheses in {folder / 'weights.pt'} do not fit: {error}") from error
     twin.noise = weights.get("noise", twin.noise)
     return LoadedRun(
         config=config,
@@ -268,22 +276,6 @@ def load_run(
         initial_closure=initial,
         folder=folder,
     )
-
-
-def _twin(
-    folder: Path, config: RunConfig, physics: Plant, closure: nn.Module, hypotheses: dict[str, Any] | None
-) -> DigitalTwin:
-    """The twin of a run; one that had no hypotheses is alone."""
-    if hypotheses is None:
-        return DigitalTwin(physics, closure)
-    twin = make_twin(physics, closure, config.twinning.hypotheses)
-    try:
-        if isinstance(twin, TwinEnsemble):
-            twin.load_hypotheses(hypotheses)
-            return twin
-        raise ValueError(f"plant {physics.name!r} suspects nothing any more.")
-    except ValueError as error:
-        raise ValueError(f"the hypotheses in {folder / 'weights.pt'} do not fit: {error}") from error
 
 
 def _rebuilt(
