@@ -156,8 +156,7 @@ def export_controller(policy: nn.Module, path: Path | str, plant: Plant, *, name
             traced (the message names the line), a controller state depends on the closure, the file does not compile,
             or the controller in C differs from that in torch.
     """
-    name = f"{plant.name}_controller" if name is None else name
-    path = c_file.require_names(path, name)
+    path, name = c_file.named(path, name, f"{plant.name}_controller")
     return CController(Controller(plant, detached(policy, plant)), name).write(path)
 
 

@@ -177,17 +177,18 @@ def compile_c(compiler: str, file: Path, *options: str) -> Path:
     return library
 
 
-def require_names(path: Path | str, name: str) -> Path:
-    """The path of a C file, after a check of it and of the name of its functions.
+def named(path: Path | str, name: str | None, usual: str) -> tuple[Path, str]:
+    """The path of a C file and the name of its functions, or the usual one for None, after a check of both.
 
     Raises:
         ValueError: if the path does not end in ``.c``, or C does not take the name.
     """
+    name = usual if name is None else name
     if Path(path).suffix != ".c":
         raise ValueError(f"path={path} of a C file must end in .c; the header's name is made of it.")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"function={name!r} must be a name in C, such as blade_controller.")
-    return Path(path)
+    return Path(path), name
 
 
 def write_c(
@@ -323,8 +324,7 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
         ValueError: if the path or the name does not fit, the policy does not fit the plant or cannot be traced (the
             message names the line), the file does not compile, or the function does not agree with the policy.
     """
-    name = f"{plant.name}_policy" if function is None else function
-    path, policy = require_names(path, name), detached(policy, plant)
+    (path, name), policy = named(path, function, f"{plant.name}_policy"), detached(policy, plant)
     points = sample_observations(plant.observations, OBSERVATIONS)
     with torch.no_grad():
         expected = policy(points)
@@ -377,8 +377,8 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
         ValueError: if the path or the name does not fit, plant or closure cannot be traced (the message names the
             line), the file does not compile, or the function does not agree with the plant.
     """
-    name = f"{plant.name}_twin" if name is None else name
-    path, plant, closure = require_names(path, name), frozen(plant), frozen(closure)
+    path, name = named(path, name, f"{plant.name}_twin")
+    plant, closure = frozen(plant), frozen(closure)
     points, ends = _flights(plant, closure)
 
     def step(**point: Tensor) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from torch import nn
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached
 from rt_torchrl.export.c_controller import CController, Controller
-from rt_torchrl.export.c_file import STRICT, compile_c, compiler, require_names
+from rt_torchrl.export.c_file import STRICT, compile_c, compiler, named
 from rt_torchrl.export.fmu import SUFFIXES
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import place_of
@@ -89,8 +89,7 @@ def export_discon(policy: nn.Module, path: Path | str, plant: Plant, *, name: st
         ValueError: if the actions are not generator_torque [N m] and blade_pitch [deg], the policy needs a signal that
             the swap array does not give, or :func:`export_controller` refuses policy, path or name.
     """
-    name = f"{plant.name}_controller" if name is None else name
-    path, cc = require_names(path, name), compiler()
+    (path, name), cc = named(path, name, f"{plant.name}_controller"), compiler()
     places = places_of(plant)
     controller = CController(Controller(plant, detached(policy, plant)), name)
     words = {"NAME": name} | _words(controller, *places)

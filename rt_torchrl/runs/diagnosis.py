@@ -181,9 +181,8 @@ def _merits(run: LoadedRun) -> Reason:
     if not dearer:
         return Reason(name, False, "it is cheaper than no classical controller", remedy)
     for key in dearer:
-        other = others[key]
         for quantity, value in merit.items():
-            mean, its_mean = value["mean"], other["merit"][quantity]["mean"]
+            mean, its_mean = value["mean"], others[key]["merit"][quantity]["mean"]
             if None not in (mean, its_mean) and abs(mean - its_mean) > MERIT * abs(its_mean):
                 differences.append(f"{quantity} {mean:.3g} against {its_mean:.3g} of {key}")
     if differences:

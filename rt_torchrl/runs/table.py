@@ -201,10 +201,8 @@ def law_lines(law: dict[str, Any]) -> list[str]:
     ranges = [f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in law["features"].items()]
     lines = [f"  law of the closure where its last records went, {', '.join(ranges)}:"]
     for name, output in list(law["outputs"].items())[:MOST_WEIGHTS]:
-        (low, high), median, greatest = (
-            output["range"],
-            *(_number(output[key], ".2g") for key in ("median", "greatest")),
-        )
+        low, high = output["range"]
+        median, greatest = (_number(output[key], ".2g") for key in ("median", "greatest"))
         lines.append(f"    {name} from {low:.4g} to {high:.4g}, standard error {median} (median), at most {greatest}")
     return lines
 
