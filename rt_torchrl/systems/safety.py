@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.atomic_file import finite
 from rt_torchrl.options import array_of, other_units, require_range
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.config import OperatingLimitsConfig, Range, SafetyConfig
+from rt_torchrl.systems.config import OperatingLimitsConfig, SafetyConfig
 from rt_torchrl.systems.environment import AroundSystem, layers
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -439,7 +439,7 @@ def require_layer(env: EnvBase) -> None:
         )
 
 
-def _outside(values: Tensor, ends: Range) -> Bool[Tensor, "*batch n"]:
+def _outside(values: Tensor, ends: Sequence[float | Sequence[float]]) -> Bool[Tensor, "*batch n"]:
     """Where values do not lie between their ends, as NaN never does."""
     low, high = (torch.as_tensor(end, dtype=values.dtype, device=values.device) for end in ends)
     return ~((values >= low) & (values <= high))
