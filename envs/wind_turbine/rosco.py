@@ -24,6 +24,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import RealController
 from rt_torchrl.loading import of_extra
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import whole_multiple
 from rt_torchrl.systems.adapters import CallingSimulator, Controller
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -172,15 +173,8 @@ def simulate(plant: Plant, seed: int, answer: Callable[[Tensor, np.ndarray], Any
 
 
 def steps_of(plant: Plant) -> int:
-    """The number of the simulator's steps in a control interval.
-
-    Raises:
-        ValueError: if the interval is no multiple of a step.
-    """
-    steps = round(plant.dt / STEP)
-    if steps < 1 or not math.isclose(steps * STEP, plant.dt):
-        raise ValueError(f"dt={plant.dt} s must be a multiple of the {STEP} s of ROSCO's simulator, such as 0.5.")
-    return steps
+    """The number of the simulator's steps in a control interval, which must be a multiple of them."""
+    return whole_multiple("dt", plant.dt, STEP)
 
 
 def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:

@@ -85,7 +85,7 @@ class CommandCost:
 
     def __init__(self, plant: Plant, closure: nn.Module, n: int, *, hold: int = 1):
         require_double("closure", closure)
-        ranges = SmoothClip(plant.actions)  # which refuses infinite ones
+        SmoothClip(plant.actions)  # which refuses infinite ranges
         if plant.end_cost is not None:
             raise ValueError(
                 f"episodes of plant {plant.name!r} may end early, which optimal commands do not consider: leave out "
@@ -93,7 +93,6 @@ class CommandCost:
             )
         self.plant, self.n, self.hold = plant, n, hold
         self.interval = PenalisedInterval(plant, closure)
-        self._low, self._span = ranges.low.numpy(), (ranges.high - ranges.low).numpy()
         self._first = np.arange(0, n, hold)
         self._code: IntervalCode | None = None
 
@@ -104,7 +103,7 @@ class CommandCost:
 
     def commands(self, plan: Plan) -> Float[Tensor, "n n_a"]:
         """The commands of all n intervals, in their own units."""
-        return torch.from_numpy(self._low + self._span * self._repeated(plan))
+        return self.interval.low + self.interval.span * torch.from_numpy(self._repeated(plan))
 
     def _repeated(self, plan: Plan) -> Float[np.ndarray, "n n_a"]:
         return np.repeat(plan, self.hold, 0)[: self.n]
@@ -129,7 +128,7 @@ class CommandCost:
         self._x, self._states = x.numpy(), np.empty((n + 1, n_s, lanes))
         self._states[0] = self._state.numpy().T
         self._costate, self._by_drive = np.empty((n_s, lanes)), np.empty((n, n_x, lanes))
-        driven = signals_of([x]), 0, 0, 0
+        driven = signals_of([x]), 0, 0
         adjoint = np.zeros((1, n_s, lanes)), 0, self._costate, weights, self._by_drive, np.zeros((0, lanes)), n
         self._march = code.march.bound(*driven, self._states, weights, n)
         self._sweep = code.sweeps[True].bound(*driven, self._states, *adjoint)

@@ -16,6 +16,7 @@ from rt_torchrl.control.forecasts import Decaying, Forecast, held
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import AtLeastOne, NotNegative, Positive, configuration
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import whole_multiple
 from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, State
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -91,22 +92,14 @@ class RecedingHorizon:
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig, *, forecast: Forecast | None = None):
         self.plant, self.config = plant, config
         self.forecast: Forecast = forecast or held
-        hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
-        self.horizon = self._whole("horizon", config.length(plant), hold)
-        self.period = hold if config.period is None else self._whole("period", config.period, hold)
+        hold = whole_multiple("hold", config.hold or plant.dt, plant.dt)
+        self.horizon = hold * whole_multiple("horizon", config.length(plant), hold * plant.dt)
+        self.period = hold * whole_multiple("period", config.period or hold * plant.dt, hold * plant.dt)
         if self.period > self.horizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.length(plant)} s.")
         self.cost = CommandCost(plant, constant(closure), self.horizon, hold=hold)
         self.solves: list[Solve] = []
         self.begin()
-
-    def _whole(self, argument: str, seconds: float, multiple: int) -> int:
-        """A time in control intervals, which is a whole multiple of others."""
-        unit = multiple * self.plant.dt
-        count = round(seconds / unit)
-        if count < 1 or abs(count * unit - seconds) > 1e-6 * unit:
-            raise ValueError(f"{argument}={seconds} s must be a whole multiple of {unit:g} s.")
-        return count * multiple
 
     def begin(self) -> None:
         """Begin new episodes."""

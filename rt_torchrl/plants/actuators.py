@@ -10,6 +10,7 @@ from torch import nn
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.extension import Extension, replaced
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import whole_multiple
 from rt_torchrl.plants.shapes import Action, Cost, Hidden, State
 from rt_torchrl.plants.signal import Signal, place_of
 
@@ -190,10 +191,10 @@ class DelayedActuator(Actuator):
     """
 
     def __init__(self, base: Plant, action: str, delay: float):
-        n, signal = round(delay / base.dt), _signal_of(base, action)
-        if not (1 <= n <= LONGEST_DELAY and math.isclose(n * base.dt, delay, rel_tol=1e-9)):
+        n, signal = whole_multiple(f"delay of {action}", delay, base.dt), _signal_of(base, action)
+        if n > LONGEST_DELAY:
             raise ValueError(
-                f"delay={delay} s of {action} must be 1 to {LONGEST_DELAY} control intervals of {base.dt:g} s; "
+                f"delay={delay} s of {action} must be at most {LONGEST_DELAY} control intervals of {base.dt:g} s; "
                 "approximate a longer one by LaggedActuator with several stages."
             )
         hidden = [

@@ -27,16 +27,10 @@ class ExtendedClosure(nn.Module):
     def __init__(self, base: nn.Module, parameters: nn.Module):
         super().__init__()
         self.base, self.own = base, parameters
-
-    @property
-    def names(self) -> dict[str, str]:
+        self.names: dict[str, str] = {**getattr(base, "names", {}), **getattr(parameters, "names", {})}
         """Unit of each coefficient, by name, of both parts."""
-        return {**getattr(self.base, "names", {}), **getattr(self.own, "names", {})}
-
-    @property
-    def meanings(self) -> dict[str, str]:
+        self.meanings: dict[str, str] = {**getattr(base, "meanings", {}), **getattr(parameters, "meanings", {})}
         """What each coefficient is, by name, of both parts."""
-        return {**getattr(self.base, "meanings", {}), **getattr(self.own, "meanings", {})}
 
     def named_coefficients(self) -> dict[str, Tensor]:
         """Coefficients of both parts by name; a part that does not name its coefficients has none here."""
@@ -264,8 +258,8 @@ class Catalogue(NamedTuple):
     systems: Mapping[str, System]
     parts: tuple[str, ...]
 
-    def changes(self, names: Sequence[str]) -> dict[str, Change]:
-        """What the named systems change, by part.
+    def __call__(self, plant: Plant, names: Sequence[str]) -> Plant:
+        """The plant, which a twin knows, with all that the named systems have beside it.
 
         Raises:
             ValueError: if a name does not exist, or two of the systems change the same part.
@@ -279,15 +273,6 @@ class Catalogue(NamedTuple):
             if twice:
                 raise ValueError(f"unknown={tuple(names)}: two of them change the {' and the '.join(twice)}.")
             changes |= self.systems[name]
-        return changes
-
-    def __call__(self, plant: Plant, names: Sequence[str]) -> Plant:
-        """The plant, which a twin knows, with all that the named systems have beside it.
-
-        Raises:
-            ValueError: as :meth:`changes`.
-        """
-        changes = self.changes(names)
         for part in self.parts:
             plant = changes[part](plant) if part in changes else plant
         return plant

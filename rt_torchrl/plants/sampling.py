@@ -62,6 +62,24 @@ def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy
         )
 
 
+def whole_multiple(argument: str, seconds: float, unit: float) -> int:
+    """The number of units that a time is.
+
+    Args:
+        argument: name of the time, for the message.
+        seconds: the time [s].
+        unit: the unit, such as a control interval [s].
+
+    Raises:
+        ValueError: if the time is no whole multiple of the unit.
+    """
+    count = round(seconds / unit)
+    if count < 1 or abs(count * unit - seconds) > 1e-6 * unit:
+        nearest = max(1, count) * unit
+        raise ValueError(f"{argument}={seconds} s must be a whole multiple of {unit:.9g} s, such as {nearest:.9g} s.")
+    return count
+
+
 def whole_steps(plant: str, dt: float, horizon: float) -> int:
     """The number of control intervals in an episode.
 
@@ -83,13 +101,7 @@ def whole_steps(plant: str, dt: float, horizon: float) -> int:
             f"horizon={horizon} s of plant {plant!r} is {horizon / dt:.3g} steps dt={dt} s; it must be at most "
             f"{MOST_STEPS:.0e}, because an episode is kept in memory."
         )
-    steps = round(horizon / dt)
-    if steps < 1 or abs(steps * dt - horizon) > 1e-6 * dt:
-        raise ValueError(
-            f"horizon={horizon} s of plant {plant!r} must be a whole number of steps dt={dt} s; "
-            f"try {max(1, steps) * dt} s."
-        )
-    return steps
+    return whole_multiple("horizon", horizon, dt)
 
 
 @runtime_checkable

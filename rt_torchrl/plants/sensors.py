@@ -12,7 +12,6 @@ from torch.nn import functional
 
 from rt_torchrl.plants.extension import Extension, FurtherInputs, replaced
 from rt_torchrl.plants.plant import Plant, Transition, with_memories
-from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.shapes import Action, Hidden, Input, Observation, State, Time
 from rt_torchrl.plants.signal import Signal, place_of
 
@@ -244,9 +243,7 @@ class StackedObservations(Extension):
         further = self.base.further_suspects()
         return {name: StackedObservations(suspect, self.count) for name, suspect in further.items()}
 
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """A saturated affine law of all observations; the plant's own policy knows the present one alone."""
-        return SaturatedAffine(len(self.observations), self.actions, generator=generator)
+    make_policy = Plant.make_policy  # of all observations; the plant's own policy knows the present one alone
 
 
 def _past(signals: tuple[AnySignal, ...], count: int) -> list[AnySignal]:

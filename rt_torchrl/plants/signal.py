@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_number
+from rt_torchrl.plants.sampling import whole_multiple
 
 Values = TypeVar("Values", Tensor, np.ndarray)
 
@@ -189,12 +190,7 @@ class Preview:
         Raises:
             ValueError: if the time ahead is no whole number of control intervals ``dt`` [s].
         """
-        steps = round(self.lead / dt)
-        if steps < 1 or not math.isclose(steps * dt, self.lead, rel_tol=1e-9):
-            raise ValueError(
-                f"a preview of {self.lead} s needs a control interval that divides it; dt={dt} s does not."
-            )
-        series = exogenous[..., self.index]
+        steps, series = whole_multiple("lead of a preview", self.lead, dt), exogenous[..., self.index]
         held = series[..., -1:].expand(*series.shape[:-1], min(steps, series.shape[-1]))
         return torch.cat([series[..., steps:], held], -1)
 

@@ -7,7 +7,7 @@ import platform
 import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +28,7 @@ STACK = 2**17
 """Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
 SMALL = 8
 """Size of arrays that always lie on the stack, from where LLVM takes them into registers."""
-X = "ptr noalias %x, i64 %first, i64 %last, i64 %row"
+X = "ptr noalias %x, i64 %first, i64 %last"
 """Parameters of functions that read a drive, see :func:`march_text`."""
 OPTIMISATION, LONG = 2, 20_000
 """Level at which LLVM optimises, and number of lines of a text beyond which it takes the code as it was written: its
@@ -81,33 +81,18 @@ def lanes_of_this_machine() -> Lanes:
 
 @cache
 def symbol(name: str, lanes: Lanes) -> str | None:
-    """The C library's vector function for these lanes, made known to LLVM; None where the library has none."""
-    library = _vector_library()
+    """The C library's vector function for these lanes; None where the library has none."""
+    load_functions()
     mangled = f"_ZGV{lanes.variant}N{lanes.number}{'v' * FUNCTIONS[name]}_{name}"
-    if library is None or not lanes.variant or not hasattr(library, mangled):
-        return None
-    _publish(library, mangled)
-    return mangled
+    return mangled if lanes.variant and llvm.address_of_symbol(mangled) else None
 
 
 @cache
-def publish_scalar_functions() -> None:
-    """Make the C library's functions of one number, and those of memory, known to LLVM."""
-    library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
-    for name in (*FUNCTIONS, *(INTRINSICS.get(name, name) for name in ROUNDED if name != "abs"), "malloc", "free"):
-        _publish(library, name)
-
-
-@cache
-def _vector_library() -> ctypes.CDLL | None:
-    try:
-        return ctypes.CDLL("libmvec.so.1")  # the vector functions of glibc 2.22, all of them since 2.35
-    except OSError:
-        return None
-
-
-def _publish(library: ctypes.CDLL, name: str) -> None:
-    llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0)
+def load_functions() -> None:
+    """Make the C library's functions known to LLVM, of one number and, where it has them, of vectors."""
+    llvm.load_library_permanently("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
+    with suppress(RuntimeError):
+        llvm.load_library_permanently("libmvec.so.1")  # of glibc 2.22, with all functions since 2.35
 
 
 class LaneWriter:
@@ -248,14 +233,14 @@ class LaneWriter:
     def inputs(self, sizes: dict[str, int], k: str) -> dict[tuple[str, int], str]:
         """Drive and state of interval k, see :func:`march_text`."""
         n, inputs = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
-        count, row = self._in_all("i64", "%last"), self.emit(f"add nsw i64 {k}, %row")
+        count = self._in_all("i64", "%last")
         lane = self.emit(f"add <{n} x i64> {self._numbers()}, {self._in_all('i64', '%first')}")
         lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
         for j in range(sizes["x"]):
             at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
             kinds = zip(("ptr", "i64", "i64"), at, strict=True)
             start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
-            address = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
+            address = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {k}, {along}')}")
             distance = self.emit(f"mul <{n} x i64> {lane}, {self._in_all('i64', across)}")
             inputs["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {address}, <{n} x i64> {distance}"))
         return inputs
@@ -282,11 +267,11 @@ def _bits(number: float) -> str:
 
 
 def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lanes: Lanes) -> str:
-    """A function ``march(x, first, last, row, s, w, n)``, which writes the states s[1] ... s[n] after s[0].
+    """A function ``march(x, first, last, s, w, n)``, which writes the states s[1] ... s[n] after s[0].
 
     ``s`` holds lanes, ``n+1 n_s lanes``, and ``w`` the weights. ``x`` has the address of every signal of the drive, and
     the bytes to the next realisation and to the next interval. The lanes are the realisations ``first`` to ``last``,
-    which also fills the lanes that are left, and their drive begins with the interval ``row``.
+    which also fills the lanes that are left.
     """
     writer = LaneWriter(lanes, "march")
     with writer.loop("%n") as k:
@@ -297,7 +282,7 @@ def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lan
 
 
 def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[str, int], lanes: Lanes) -> str:
-    """A function ``sweep(x, first, last, row, s, source, stride, l, w, gx, gw, n)``, which goes back to interval 0.
+    """A function ``sweep(x, first, last, s, source, stride, l, w, gx, gw, n)``, which goes back to interval 0.
 
     It adds the row k·stride of ``source`` (∂J/∂s_{k+1}) to the co-state ``l``, replaces this by the co-state at the
     start of the interval, writes the gradients by the interval's own inputs into ``gx`` and adds those by the weights
@@ -331,7 +316,7 @@ class ObjectCode:
     """
 
     def __init__(self, text: str, name: str, arguments: tuple[type, ...]):
-        publish_scalar_functions()
+        load_functions()
         code = llvm.ObjectFileRef.from_data(_compiled(text))
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         self._engine.add_object_file(code)

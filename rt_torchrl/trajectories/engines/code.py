@@ -24,7 +24,7 @@ from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.programs.tracer import STRAIGHT, Tracer
 from rt_torchrl.trajectories.engines.interval import Drive, costate_products, with_weights
 
-X = (ctypes.c_void_p, *[ctypes.c_int64] * 3)
+X = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 MARCH = (*X, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 SWEEP = (*X, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 4, ctypes.c_int64)
 """Types of the arguments of :func:`march_text` and :func:`sweep_text`."""
@@ -131,11 +131,11 @@ class Point(NamedTuple):
     state: Tensor
     drive: Drive
 
-    def in_lanes(self) -> tuple[tuple[np.ndarray, int, int, int], np.ndarray]:
+    def in_lanes(self) -> tuple[tuple[np.ndarray, int, int], np.ndarray]:
         """Drive, as machine code takes it, and states ``1 n_s lanes``, one realisation in each lane."""
         lanes, (t, *rest) = Group(0, len(self.state), len(self.state)), self.drive
         signals = signals_of(x.unsqueeze(0) for x in (t.unsqueeze(-1), *rest))
-        return (signals, 0, lanes.last - 1, 0), lanes.gather(self.state.unsqueeze(0).numpy())
+        return (signals, 0, lanes.last - 1), lanes.gather(self.state.unsqueeze(0).numpy())
 
     def rows(self, chosen: Tensor) -> "Point":
         """Some of the realisations."""

@@ -80,19 +80,15 @@ class _Task:
         self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row()
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
-        self._signals = signals_of(self.drive)
+        self.signals = signals_of(self.drive)
 
     def march(self, group: Group) -> np.ndarray:
         """The states ``n+1 n_s lanes`` of a group."""
         states = np.empty((self.n + 1, self.code.sizes["s"], self.lanes))
         states[0] = 0.0
         states[0, : self.initial_state.shape[1]] = group.gather(self.initial_state[None])[0]
-        self.code.march(*self.driving(group), states, self.row, self.n)
+        self.code.march(self.signals, group.first, group.last - 1, states, self.row, self.n)
         return states
-
-    def driving(self, group: Group) -> tuple[np.ndarray, int, int, int]:
-        """The drive of a group, as machine code takes it."""
-        return self._signals, group.first, group.last - 1, 0
 
 
 class _Gradients:
@@ -125,7 +121,7 @@ class _Gradients:
         costate[-1] = last
         by_drive = np.empty((task.n, task.code.sizes["x"], group.lanes) if self._by_drive is not None else 0)
         arrays = states, source, int(len(source) > 1), costate, task.row, by_drive, by_weights
-        self._sweep(*task.driving(group), *arrays, task.n)
+        self._sweep(task.signals, group.first, group.last - 1, *arrays, task.n)
         if self._by_drive is not None:
             group.scatter(by_drive, self._by_drive)
         group.scatter(costate[None, : self._by_state.shape[-1]], self._by_state)
