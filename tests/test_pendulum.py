@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
 
 from rt_torchrl import AssimilationConfig, DigitalTwin, Trajectory
-from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
+from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
 from rt_torchrl.fit.log import checked
@@ -55,7 +55,7 @@ def test_a_step_is_gymnasiums(mass, length):
     theirs, rewards = gymnasium_steps(states, commands, mass=mass, length=length)
     # The same operations in another order: rounding of numbers up to 8.
     torch.testing.assert_close(end[:, 1], theirs[:, 1], rtol=0, atol=1e-13)
-    assert wrapped(end[:, 0] - theirs[:, 0]).abs().max() < 1e-13
+    assert Pendulum.states[0].wrapped(end[:, 0] - theirs[:, 0]).abs().max() < 1e-13
     torch.testing.assert_close(-plant.running_cost(t, states, applied, nothing), rewards, rtol=1e-13, atol=1e-13)
     # The stops of torque and speed have been met, and not everywhere.
     assert all(5 < stopped.sum() < 495 for stopped in (applied.abs() == 2.0, end[:, 1].abs() == 8.0))
@@ -70,7 +70,7 @@ def test_the_real_system_reports_gymnasiums_reward_and_starts():
     following, rewards = gymnasium_steps(states, actions)
     # Gymnasium reports cosine, sine and speed in single precision: 6e-8 of numbers up to 8, in costs up to 16.
     torch.testing.assert_close(episode["next", "reward"][0, :, 0], rewards, rtol=1e-6, atol=1e-6)
-    assert wrapped(following[:, 0] - episode["next", "state"][0, :, 0]).abs().max() < 5e-6
+    assert Pendulum.states[0].wrapped(following[:, 0] - episode["next", "state"][0, :, 0]).abs().max() < 5e-6
     torch.testing.assert_close(following[:, 1], episode["next", "state"][0, :, 1], rtol=0, atol=5e-6)
     assert states[0, 1].abs() <= 1.0
 

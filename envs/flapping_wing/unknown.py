@@ -31,12 +31,11 @@ UNKNOWN_ACCELERATION = 2.0
 """Size of an unknown acceleration [m/s²], a fifth of gravity."""
 
 
-def tilting(plant: Plant, *, frequency: float, damping: float) -> Plant:
-    """A stroke plane that a weak servo tilts.
+tilting = partial(ResonantActuator, action=PLANE)
+"""A stroke plane that a weak servo tilts.
 
-    Frequency [rad/s] and damping: engineering guesses; a servo of a drone of 3 g turns the plane within some 0.2 s.
-    """
-    return ResonantActuator(plant, PLANE, frequency, damping)
+Frequency [rad/s] and damping: engineering guesses; a servo of a drone of 3 g turns the plane within some 0.2 s.
+"""
 
 
 def late(plant: Plant, *, delay: float) -> Plant:
@@ -56,12 +55,11 @@ def lagging(plant: Plant, *, amplitude: float, plane: float | None = None) -> Pl
     return lagged if plane is None else LaggedActuator(lagged, PLANE, plane)
 
 
-def sagging(plant: Plant) -> Plant:
-    """A battery whose voltage sags, and with it the amplitude.
+sagging = partial(ScaledActuator, action=AMPLITUDE, gain=0.95)
+"""A battery whose voltage sags, and with it the amplitude.
 
-    Loss 5 %: engineering guess.
-    """
-    return ScaledActuator(plant, AMPLITUDE, 0.95)
+Loss 5 %: engineering guess.
+"""
 
 
 PARTS = ("supply", "stroke plane", "drives", "link")

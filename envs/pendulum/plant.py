@@ -116,12 +116,12 @@ class Pendulum(Plant):
         .. math:: \dot\theta' = \mathrm{stop}(\dot\theta + \ddot\theta\,\Delta t), \qquad
             \theta' = \theta + \dot\theta'\,\Delta t
 
-        The angle is kept within ±π, which its sine and cosine determine.
+        The angle is kept in [−π, π), which its sine and cosine determine, as by Gymnasium's ``angle_normalize``.
         """
         theta, rate = state.unbind(-1)
         acceleration = self.vector_field(t, state, applied, exogenous, closure)[..., 1]
         rate = (rate + acceleration * self.dt).clamp(-self.greatest_speed, self.greatest_speed)
-        return torch.stack([wrapped(theta + rate * self.dt), rate], -1)
+        return torch.stack([self.states[0].wrapped(theta + rate * self.dt), rate], -1)
 
     # The control problem
 
@@ -133,7 +133,7 @@ class Pendulum(Plant):
     def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         """The cost θ² + 0.1 (dθ/dt)² + 0.001 u² with θ within ±π, the negative of Gymnasium's reward."""
         theta, rate = state.unbind(-1)
-        return wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
+        return self.states[0].wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
 
     discrepancy_scales = (1.0, math.sqrt(15.0))
     """L_p is ½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² of a hanging rod."""
@@ -143,7 +143,7 @@ class Pendulum(Plant):
         t = self.dt * torch.arange(applied.shape[1], dtype=states.dtype, device=states.device)
         cost = self.running_cost(t, states[:, :-1], applied, exogenous)
         last = states[:, -(applied.shape[1] // 4) :, 0]
-        upright = (torch.atan2(last.sin(), last.cos()).abs() < UPRIGHT).to(states.dtype)
+        upright = (self.states[0].wrapped(last).abs() < UPRIGHT).to(states.dtype)
         return {"return [-]": -cost.sum(-1), "upright in the last quarter [%]": 100.0 * upright.mean(-1)}
 
     # Randomness
@@ -164,8 +164,3 @@ class Pendulum(Plant):
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """A perceptron, because no affine law of cos θ, sin θ and dθ/dt swings the rod up and also holds it there."""
         return SaturatedMLP(len(self.observations), self.actions, hidden=self.hidden, generator=generator)
-
-
-def wrapped(angle: Tensor) -> Tensor:
-    """The angle, moved into [−π, π) by whole turns as by Gymnasium's ``angle_normalize``."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

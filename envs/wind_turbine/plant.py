@@ -69,10 +69,6 @@ def speed_rate(plant: "WindTurbine", t: Tensor, state: Tensor, exogenous: Tensor
     return plant.gear_ratio * state[..., 0] - state[..., 6]
 
 
-def _of_state(index: int, offset: float, scale: float) -> Measurement:
-    return Measurement.of(STATES[index], offset=offset, scale=scale)
-
-
 def _of_wind(signal: Signal, read: Preview | None = None) -> Measurement:
     return Measurement.of(signal, read, offset=11.0, scale=3.0)
 
@@ -172,11 +168,11 @@ class WindTurbine(Plant):
     measurements = (
         Measurement(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0, read=speed_error),
         Measurement.of(ERROR_INTEGRAL, Named(ERROR_INTEGRAL.name)),
-        _of_state(0, RATED_ROTOR_SPEED, 0.2),
-        _of_state(1, RATED_GENERATOR_SPEED, GAMMA_1),
-        _of_state(2, 11.0, 3.0),
-        _of_state(4, 0.5 * RATED_TORQUE, 0.5 * RATED_TORQUE),
-        _of_state(5, 0.0, GREATEST_PITCH),
+        Measurement.of(STATES[0], offset=RATED_ROTOR_SPEED, scale=0.2),
+        Measurement.of(STATES[1], offset=RATED_GENERATOR_SPEED, scale=GAMMA_1),
+        Measurement.of(STATES[2], offset=11.0, scale=3.0),
+        Measurement.of(STATES[4], offset=0.5 * RATED_TORQUE, scale=0.5 * RATED_TORQUE),
+        Measurement.of(STATES[5], scale=GREATEST_PITCH),
         *OF_FAST_SPEED,
         _of_wind(WIND),
         *map(_ahead, LEADS),

@@ -245,12 +245,10 @@ def untraceable(calls: Calls) -> str | None:
     Whatever the code raises for one realisation keeps it from the plant.
     """
     plant, arguments, lanes = calls.plant, calls.arguments, lanes_of_this_machine()
-    policy = plant.make_policy(seeded())
-    initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
+    interval = CostInterval(Interval(plant, calls.closure, plant.make_policy(seeded())))
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"][..., :0])
-    point = point_of(initial_state, drive, lanes.number)
+    point = point_of(arguments["state"][0], drive, lanes.number, interval.sums)
     try:
-        interval = CostInterval(Interval(plant, calls.closure, policy))
         IntervalCode(interval, point, lanes).prepare_sweep(interval, False)
     except Exception as error:
         return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {first_line(error)}"

@@ -38,14 +38,17 @@ class Method(NamedTuple):
 class Calls:
     """Times, states, commands, actions and inputs of episodes, with the time first as in the gradient engines.
 
+    Attribute ``arguments`` holds them by name, with ``measured`` for the states of another episode.
+
     Args:
         plant: the plant.
-        arguments: tensors by name: ``t`` of shape ``n 1``; ``state``, ``command``, ``applied``, ``exogenous`` and
-            ``measured`` (states of another episode) of shape ``n batch`` and their number of signals.
+        t: times, of shape ``n 1``.
+        state, command, applied, exogenous: of shape ``n batch`` and their number of signals.
     """
 
-    def __init__(self, plant: Plant, arguments: Arguments):
-        self.plant, self.arguments = plant, arguments
+    def __init__(self, plant: Plant, *, t: Tensor, state: Tensor, command: Tensor, applied: Tensor, exogenous: Tensor):
+        self.plant, self.arguments = plant, {"t": t, "state": state, "measured": state.roll(1, 1)}
+        self.arguments |= {"command": command, "applied": applied, "exogenous": exogenous}
         self.closure: nn.Module = plant.make_closure(seeded())
 
     @classmethod
@@ -57,7 +60,7 @@ class Calls:
         command = random_commands(plant, (2 * episodes,), generator)
         state, command, exogenous = (x.reshape(2, episodes, -1) for x in (state, command, exogenous))
         t = torch.zeros(2, 1, dtype=torch.float64)
-        return cls(plant, _named(t, state, command, exogenous, applied=command))
+        return cls(plant, t=t, state=state, command=command, applied=command, exogenous=exogenous)
 
     @classmethod
     @torch.no_grad()
@@ -73,8 +76,8 @@ class Calls:
         command = random_commands(plant, (episodes, steps), generator)
         flown = Rollout(plant, plant.closure, engine="autograd")(state, exogenous, command)
         t = plant.dt * torch.arange(steps, dtype=torch.float64).unsqueeze(-1)
-        rows = [x.transpose(0, 1).contiguous() for x in (flown.states[:, :-1], command, exogenous, flown.actions)]
-        return cls(plant, _named(t, *rows))
+        signals = {"state": flown.states[:, :-1], "command": command, "applied": flown.actions, "exogenous": exogenous}
+        return cls(plant, t=t, **{name: x.transpose(0, 1).contiguous() for name, x in signals.items()})
 
     def methods(self) -> list[Method]:
         """Every method; a method that takes a closure comes with the true closure and with that of the twin."""
@@ -122,11 +125,6 @@ def random_commands(plant: Plant, shape: tuple[int, ...], generator: torch.Gener
     low, high = bounds(plant.actions)
     share = torch.rand(*shape, len(plant.actions), generator=generator, dtype=torch.float64)
     return low + share * (high - low)
-
-
-def _named(t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor, applied: Tensor) -> Arguments:
-    names = ("t", "state", "command", "exogenous", "applied", "measured")
-    return dict(zip(names, (t, state, command, exogenous, applied, state.roll(1, 1)), strict=True))
 
 
 def _under(method: Callable[..., Any], closure: nn.Module) -> Callable[..., Any]:

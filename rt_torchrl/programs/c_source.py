@@ -7,15 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.program import COMPARISONS, ROUNDED, Program
+from rt_torchrl.programs.program import C_NAMES, COMPARISONS, ROUNDED, Program
 
 WIDTH = 110
-CALLED = {"abs": "fabs", "round": "rint"}
 FORMS = {
     **{name: f"{{0}} {sign} {{1}}" for name, sign in {"add": "+", "sub": "-", "mul": "*", "div": "/"}.items()},
     **{name: f"{{0}} {sign} {{1}}" for name, sign in zip(COMPARISONS, "> < >= <= == !=".split(), strict=True)},
     **{name: f"{{0}} {sign} {{1}}" for name, sign in {"and": "&&", "or": "||", "xor": "!="}.items()},
-    **{name: f"{CALLED.get(name, name)}({{0}})" for name in ROUNDED},
+    **{name: f"{C_NAMES.get(name, name)}({{0}})" for name in ROUNDED},
     "minimum": "{0} < {1} || {0} != {0} ? {0} : {1}",
     "maximum": "{0} > {1} || {0} != {0} ? {0} : {1}",
     "neg": "-{0}",

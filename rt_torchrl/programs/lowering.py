@@ -1,7 +1,7 @@
 """Lowering: a program becomes arithmetic, loads, stores and loops, which a writer puts into a language."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import groupby
 from typing import Protocol, runtime_checkable
@@ -85,7 +85,7 @@ class Lowering:
         array, offset, shared = self._arrays[value]
         return self.writer.load(array, self.writer.index(offset + place, terms), shared=shared)
 
-    # Arrays
+    # Arrays, each kind by a method of its name
 
     def _array(self, value: int) -> None:
         name, operands, attributes = self.program.operations[value]
@@ -96,7 +96,7 @@ class Lowering:
         else:
             array = self.writer.local(math.prod(attributes[0]))
             self._arrays[value] = (array, 0, False)
-            ARRAYS[name](self, array, operands, *attributes)
+            getattr(self, f"_{name}")(array, operands, *attributes)
 
     def _row(self, array: str, operands: Sequence[int], dims: Sequence[int]) -> None:
         for i, a in enumerate(operands):
@@ -166,11 +166,3 @@ class Lowering:
 
     def _add(self, array: str, index: str, operand: str) -> None:
         self.writer.store(array, index, self.writer.compute("add", self.writer.load(array, index), operand))
-
-
-ARRAYS: dict[str, Callable[..., None]] = {
-    "row": Lowering._row,
-    "map": Lowering._map,
-    "product": Lowering._product,
-}
-"""How an array of lanes is filled, by the operation that makes it."""

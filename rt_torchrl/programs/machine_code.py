@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.program import ARITHMETIC, COMPARISONS, EXTREMES, FUNCTIONS, ROUNDED, Program
+from rt_torchrl.programs.program import ARITHMETIC, C_NAMES, COMPARISONS, EXTREMES, FUNCTIONS, ROUNDED, Program
 
 PURE = "memory(none) nounwind willreturn speculatable"
 """Attributes of mathematical functions, by which LLVM computes once what is the same in all steps."""
@@ -35,13 +35,11 @@ OPTIMISATION, LONG = 2, 20_000
 passes take minutes there, and save a tenth of the time of a run."""
 DIGEST = hashlib.sha256().digest_size
 _memory_of = (ctypes.c_char * 0).from_buffer  # four times faster than the array's own address
-INTRINSICS = {"abs": "fabs", "round": "rint"}
-"""Names in LLVM and in the C library that are not torch's."""
 FORMS = {
     **{name: f"f{name} contract {{number}} {{0}}, {{1}}" for name in ARITHMETIC},
     **{name: f"fcmp {'une' if name == 'ne' else 'o' + name} {{number}} {{0}}, {{1}}" for name in COMPARISONS},
     **{name: f"{name} {{truth}} {{0}}, {{1}}" for name in ("and", "or", "xor")},
-    **{name: f"call {{number}} @llvm.{INTRINSICS.get(name, name)}.v{{lanes}}f64({{number}} {{0}})" for name in ROUNDED},
+    **{name: f"call {{number}} @llvm.{C_NAMES.get(name, name)}.v{{lanes}}f64({{number}} {{0}})" for name in ROUNDED},
     **{
         name: f"call nsz {{number}} @llvm.{name}.v{{lanes}}f64({{number}} {{0}}, {{number}} {{1}})" for name in EXTREMES
     },

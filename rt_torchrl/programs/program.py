@@ -13,6 +13,8 @@ COMPARISONS = ("gt", "lt", "ge", "le", "eq", "ne")
 """Comparisons, of which NaN makes all false but the last one."""
 ROUNDED = ("sqrt", "floor", "ceil", "trunc", "round", "abs")
 """Functions that are instructions of most processors; halves are rounded to even."""
+C_NAMES = {"abs": "fabs", "round": "rint"}
+"""Names of these in LLVM and in the C library that are not torch's."""
 EXTREMES = ("minimum", "maximum")
 """Extremes, which are NaN if one of the two is NaN."""
 FUNCTIONS = {
@@ -140,8 +142,8 @@ class Program:
         if len(constants) == len(known):
             return self.constant(getattr(torch, name)(*constants).item())
         kind: Kind = "truth" if name in COMPARISONS else "number"
-        simplified = SIMPLIFIED.get(name)
-        return simplified(self, *numbers) if simplified else self.new(name, *numbers, kind=kind)
+        simplified: Callable[..., int] | None = getattr(self, f"_{name}", None)  # of add, sub, mul, div and pow
+        return simplified(*numbers) if simplified else self.new(name, *numbers, kind=kind)
 
     def _is_nothing(self, a: int, *, subtracted: bool = False) -> bool:
         """Whether a value is a zero that a sum does not need: 0 − 0 is 0, but −0 + 0 is not −0."""
@@ -177,15 +179,6 @@ class Program:
         power = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
         return power if y > 0 else self.apply("div", one, power)
 
-
-SIMPLIFIED: dict[str, Callable[..., int]] = {
-    "add": Program._add,
-    "sub": Program._sub,
-    "mul": Program._mul,
-    "div": Program._div,
-    "pow": Program._pow,
-}
-"""Functions of numbers that may become simpler ones."""
 
 # Elementwise operators of torch
 

@@ -90,9 +90,7 @@ class TwinFlight(Trajectory):
 
 def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
     """Trajectories of equal length without batch dimensions as one batch."""
-    states = torch.stack([trajectory.states for trajectory in trajectories])
-    actions = torch.stack([trajectory.actions for trajectory in trajectories])
-    exogenous = torch.stack([trajectory.exogenous for trajectory in trajectories])
+    states, actions, exogenous = map(torch.stack, zip(*(trajectory[:3] for trajectory in trajectories), strict=True))
     starts = [float(trajectory.start) for trajectory in trajectories]
     together, seen = len(set(starts)) == 1, None
     if any(trajectory.seen is not None for trajectory in trajectories):
