@@ -51,14 +51,12 @@ class Saturation(nn.Module):
     2498 (CoolProp).
     """
 
-    table: Tensor
-
     def __init__(self, fluid: str = "Hydrogen"):
         super().__init__()
         if fluid not in FLUIDS:
             raise ValueError(f"fluid={fluid!r} has no table; choose one of {', '.join(FLUIDS)}.")
         self.fluid, (self.low, self.high, table) = fluid, coefficients(fluid)
-        self.register_buffer("table", torch.tensor(table))
+        self.table = nn.Buffer(torch.tensor(table))
         self._width = math.log(self.high / self.low) / CELLS
 
     def forward(self, p: Float[Tensor, "*batch"]) -> Properties:

@@ -199,14 +199,6 @@ class FlappingWing(Plant):
     """The paper's errors of position and speed; these with the wind; with the phase of the wing beat; with both; and
     what a sensor of the position alone tells, with the phase, and with the wind."""
 
-    target: Tensor
-    mass: Tensor
-    weight: Tensor
-    radius: Tensor
-    """Distances r_j of the blade elements from the flapping axis [m]."""
-    strip_mass: Tensor
-    """Weights ρ c(r_j) dr_j of the elements of both wings [kg/m]."""
-
     def __init__(
         self,
         *,
@@ -231,15 +223,16 @@ class FlappingWing(Plant):
         if not held:
             self.measurements = tuple(m for m in self.measurements if m not in OF_FILTERED)
         self.states, self.controller_states = (*POSITIONS, *SPEEDS, *held), tuple(signal.name for signal in held)
-        self.register_buffer("target", torch.tensor(target, dtype=torch.float64))
-        self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
-        self.register_buffer("weight", torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
+        self.target = nn.Buffer(torch.tensor(target, dtype=torch.float64))
+        self.mass = nn.Buffer(torch.tensor(mass, dtype=torch.float64))
+        self.weight = nn.Buffer(torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
         places, weights = np.polynomial.legendre.leggauss(self.span_nodes)
         theta = torch.from_numpy(0.25 * math.pi * (places + 1.0))
         area = 4.0 * self.mean_chord * self.wing_length / math.pi * theta.cos() ** 2
-        self.register_buffer("radius", self.wing_root + self.wing_length * theta.sin())
-        # The two wings have ½ρ c dr each.
-        self.register_buffer("strip_mass", self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
+        # Distances r_j of the blade elements from the flapping axis [m].
+        self.radius = nn.Buffer(self.wing_root + self.wing_length * theta.sin())
+        # Weights ρ c(r_j) dr_j of the elements of both wings [kg/m], of which each has half.
+        self.strip_mass = nn.Buffer(self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
         longest = 1.0 / (self.least_steps_per_beat * self.frequency)
         if dt > longest * (1.0 + 1e-9):
             raise ValueError(

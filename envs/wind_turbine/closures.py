@@ -52,9 +52,6 @@ class SaintDrenan(nn.Module):
     names = dict.fromkeys(NAMES, "-") | {"c3": "1/deg", "c4": "1/deg", "c5": "1/deg^x", "c9": "1/deg"}
     meanings = MEANINGS
 
-    scale: Tensor
-    fixed: Tensor
-
     def __init__(self, coefficients: Float[Tensor, "11"]):
         super().__init__()
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
@@ -62,9 +59,9 @@ class SaintDrenan(nn.Module):
             raise ValueError(
                 f"coefficients={coefficients.tolist()} must be 11 finite numbers, {', '.join(NAMES)}, with x above 1."
             )
-        self.register_buffer("scale", torch.tensor(self.scales, dtype=torch.float64))
+        self.scale = nn.Buffer(torch.tensor(self.scales, dtype=torch.float64))
         scaled = torch.cat([coefficients[:-1] / self.scale, torch.log((coefficients[-1:] - 1.0) / 0.5)])
-        self.register_buffer("fixed", scaled[:1].clone())
+        self.fixed = nn.Buffer(scaled[:1].clone())
         self.scaled = nn.Parameter(scaled[1:].clone())
 
     @classmethod

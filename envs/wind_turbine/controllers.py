@@ -132,10 +132,6 @@ class GainScheduled(nn.Module):
     switch_width = 1.0  # w_s of that transition [rad/s], about that of Jonkman's table
     switch_pitch = 1.0  # c, which keeps region 3 while the blades are pitched [rad/s per deg]
 
-    nominal: Tensor
-    low: Tensor
-    high: Tensor
-
     def __init__(self, plant: WindTurbine, *, generator: torch.Generator):
         super().__init__()
         names = [signal.name for signal in plant.observations]
@@ -148,10 +144,8 @@ class GainScheduled(nn.Module):
         self._names = tuple(self.NOMINAL)
         share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
         self.weights = nn.Parameter(math.log(2.0) * (2.0 * share - 1.0))
-        self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
-        low, high = bounds(plant.actions)
-        self.register_buffer("low", low)
-        self.register_buffer("high", high)
+        self.nominal = nn.Buffer(torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
+        self.low, self.high = map(nn.Buffer, bounds(plant.actions))
         self.dt = plant.dt
         self.rated_speed, self.speed_scale = plant.rated_generator_speed, plant.speed_error_scale
         self.power = plant.actions[0].high * plant.rated_generator_speed

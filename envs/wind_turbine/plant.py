@@ -186,7 +186,6 @@ class WindTurbine(Plant):
         "preview": (*ERRORS, *INSTRUMENTS, "wind_speed", *(f"wind_speed_in_{lead:g}_s" for lead in LEADS)),
     }
     controller_states: tuple[str, ...] = tuple(signal.name for signal in STATES[1:])
-    greatest_increment: Tensor
 
     def __init__(
         self,
@@ -215,7 +214,7 @@ class WindTurbine(Plant):
         # Gain K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared).
         power = 0.5 * self.air_density * math.pi * self.radius**5 * self.best_power_coefficient
         self.optimal_gain = power / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
-        self.register_buffer("greatest_increment", dt * torch.tensor(self.rate_limits, dtype=torch.float64))
+        self.greatest_increment = nn.Buffer(dt * torch.tensor(self.rate_limits, dtype=torch.float64))
         require_stable_step(
             self.name,
             dt,

@@ -55,31 +55,17 @@ class PowerCoefficientTable(nn.Module):
     Source: C. de Boor, *A Practical Guide to Splines*, chapters IV and XVII.
     """
 
-    tip_speed_ratio: Tensor
-    pitch: Tensor
-    values: Tensor
-    _lam_knots: Tensor
-    _lam_origins: Tensor
-    _beta_origins: Tensor
-    _coefficients: Tensor
-
     def __init__(self, tip_speed_ratio: Axis, pitch: Axis, values: Rows):
         super().__init__()
         lam, beta, cp = _checked(tip_speed_ratio, pitch, values)
         rows, lam_knots = _add_stall(_spline_cells(lam, cp), lam)
         cells = _spline_cells(beta, np.moveaxis(rows, -1, 0))  # [cell of β, power of β, cell of λ, power of λ]
-        arrays = {
-            "tip_speed_ratio": lam,
-            "pitch": beta,
-            "values": cp,
-            "_lam_knots": lam_knots,
-            # Origin of the local coordinate in each cell, including the outer cells.
-            "_lam_origins": np.concatenate([lam_knots[:1], lam_knots]),
-            "_beta_origins": np.concatenate([beta[:1], beta]),
-            "_coefficients": cells.transpose(2, 0, 3, 1),
-        }
-        for name, array in arrays.items():
-            self.register_buffer(name, torch.tensor(array, dtype=torch.float64))
+        self.tip_speed_ratio, self.pitch, self.values = map(_buffer, (lam, beta, cp))
+        self._lam_knots = _buffer(lam_knots)
+        # Origin of the local coordinate in each cell, including the outer cells.
+        self._lam_origins = _buffer(np.concatenate([lam_knots[:1], lam_knots]))
+        self._beta_origins = _buffer(np.concatenate([beta[:1], beta]))
+        self._coefficients = _buffer(cells.transpose(2, 0, 3, 1))
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "PowerCoefficientTable":
@@ -172,6 +158,10 @@ def _add_stall(rows: Cells, lam: Knots) -> tuple[Cells, Knots]:
     cubic = (low_slope + slope - 2 * secant) / h**2
     stall = [[zero] * 4, [zero, zero, curvature, zero], [low, low_slope, quadratic, cubic]]
     return np.concatenate([np.array(stall), rows[1:]]), np.concatenate([[0.0, lam_0], lam])
+
+
+def _buffer(array: np.ndarray) -> nn.Buffer:
+    return nn.Buffer(torch.tensor(array, dtype=torch.float64))
 
 
 def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:

@@ -41,8 +41,6 @@ class ClassicalController(nn.Module, ABC):
     """Values of the gains where none are given, in the order of :attr:`gain_units`."""
     memory_size: int = 0
     """Number of entries of the memory, such as an integral or whether a heater is on."""
-    low_action: Tensor
-    high_action: Tensor
 
     def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None):
         super().__init__()
@@ -55,9 +53,7 @@ class ClassicalController(nn.Module, ABC):
             )
         self.plant = plant
         self.log_gains = nn.Parameter(values.log(), requires_grad=False)
-        low, high = bounds(plant.actions)
-        self.register_buffer("low_action", low)
-        self.register_buffer("high_action", high)
+        self.low_action, self.high_action = map(nn.Buffer, bounds(plant.actions))
         self._engine = Native()
         self._memory: Tensor | None = None
 

@@ -46,15 +46,12 @@ class PenalisedInterval(nn.Module):
         closure: closure of the system, which asks for no gradients.
     """
 
-    low: Tensor
-    span: Tensor
-
     def __init__(self, plant: Plant, closure: nn.Module):
         super().__init__()
         self.plant, self.closure = plant, closure
         low, high = bounds(plant.actions)
-        self.register_buffer("low", low)
-        self.register_buffer("span", high - low)
+        self.low = nn.Buffer(low)
+        self.span = nn.Buffer(high - low)
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """State and cost, (s, J), at the end of the interval."""

@@ -31,15 +31,12 @@ class Decaying(nn.Module):
         ValueError: if a decay time is not positive.
     """
 
-    mean: Tensor
-    time: Tensor
-
     def __init__(self, mean: Float[Tensor, " n_z"], time: Float[Tensor, " n_z"], *, dt: float):
         super().__init__()
         if not (time > 0.0).all():
             raise ValueError(f"time={time.tolist()} s of the decay must be positive.")
-        self.register_buffer("mean", mean)
-        self.register_buffer("time", time)
+        self.mean = nn.Buffer(mean)
+        self.time = nn.Buffer(time)
         self.dt = dt
 
     @classmethod

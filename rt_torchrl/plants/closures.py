@@ -41,7 +41,6 @@ class PositiveCoefficients(nn.Module):
     """What each coefficient is, in a few words, by name; tables of results show it."""
     true_coefficients: tuple[float, ...] = ()
     """Coefficients of the real system."""
-    first: Tensor
 
     def __init__(
         self,
@@ -66,7 +65,7 @@ class PositiveCoefficients(nn.Module):
         if factor is None:
             self.log_coefficients = nn.Parameter(coefficients.log())
         else:
-            self.register_buffer("first", coefficients.clone())
+            self.first = nn.Buffer(coefficients.clone())
             self.weights = nn.Parameter(torch.zeros_like(coefficients))
 
     @classmethod
@@ -108,10 +107,6 @@ class BoundedPerceptron(nn.Module):
         ValueError: if a range is empty or a bound is not positive.
     """
 
-    middle: Tensor
-    half_range: Tensor
-    bound: Tensor
-
     def __init__(
         self,
         ranges: Sequence[tuple[float, float]],
@@ -129,9 +124,9 @@ class BoundedPerceptron(nn.Module):
             )
         self.network = mlp(len(ranges), hidden, len(bounds), generator=generator)
         nn.init.zeros_(self.network[-1].get_parameter("weight"))
-        self.register_buffer("middle", 0.5 * (low + high))
-        self.register_buffer("half_range", 0.5 * (high - low))
-        self.register_buffer("bound", bound)
+        self.middle = nn.Buffer(0.5 * (low + high))
+        self.half_range = nn.Buffer(0.5 * (high - low))
+        self.bound = nn.Buffer(bound)
 
     def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))

@@ -25,19 +25,14 @@ class SmoothClip(nn.Module):
         ValueError: if an action has no finite range.
     """
 
-    low: Tensor
-    high: Tensor
-
     def __init__(self, actions: Sequence[Signal], *, device: torch.device | None = None):
         super().__init__()
-        low, high = bounds(actions, device=device)
-        if not (low.isfinite() & high.isfinite()).all():
+        self.low, self.high = map(nn.Buffer, bounds(actions, device=device))
+        if not (self.low.isfinite() & self.high.isfinite()).all():
             raise ValueError(
                 f"the ranges of {', '.join(f'{a.name} [{a.low}, {a.high}] {a.unit}' for a in actions)} must be finite: "
                 "give each Signal a low and a high."
             )
-        self.register_buffer("low", low)
-        self.register_buffer("high", high)
 
     def forward(self, x: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         return 0.5 * (torch.tanh(x) + 1.0) * (self.high - self.low) + self.low
