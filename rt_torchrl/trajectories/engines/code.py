@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.programs.contract import Compared, Executed, Holdings, ImpureError, inputs_of, outside_of, require_pure
+from rt_torchrl.programs.contract import Executed, Holdings, ImpureError, inputs_of, outside_of, require_pure
 from rt_torchrl.programs.machine_code import Lanes, ObjectCode, lanes_of_this_machine, march_text, sweep_text
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.rules import new_tracer
@@ -184,8 +184,6 @@ class IntervalCode:
         self.point, self.lanes = point, lanes
         self.sweeps: dict[bool, ObjectCode] = {}
         """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
-        self.outside = Compared()
-        """Constants outside of the interval that its code has read."""
         self._executed, holdings = Executed(), holdings or Holdings(interval)
         tracer = new_tracer(getattr(interval, "straight", STRAIGHT))
         state, drive, weights = _traced_inputs(tracer, interval, point)
@@ -201,6 +199,7 @@ class IntervalCode:
         with torch.no_grad(), self._executed.noted():
             exact = interval(*point).numpy()
         self.outside = outside_of(interval, holdings, self._executed)
+        """Constants outside of the interval that its code has read."""
         require_equal("the end state", states[1].T, exact, point.state.numpy())
 
     def prepare_sweep(self, interval: nn.Module, driven: bool, holdings: Holdings | None = None) -> None:
