@@ -20,7 +20,7 @@ import pytest
 import torch
 from fault_victim import EPISODES, QUICK, SHIPPED, victim
 from small_runs import small_run
-from test_run_folder import Bomb, same
+from test_run_folder import Bomb
 
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import load_tensors, plain, save_tensors
@@ -29,6 +29,17 @@ pytestmark = pytest.mark.training
 
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""
+
+
+def same(one, other):
+    """Whether two contents of a checkpoint are the same, in whatever order their keys stand."""
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return type(one) is type(other) and all(map(same, one, other)) and len(one) == len(other)
+    return one == other
 
 
 @pytest.fixture(scope="module")
