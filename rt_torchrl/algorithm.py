@@ -272,10 +272,8 @@ class ReinforcementTwinning(TensorDictSequential):
             Whether the live policy has changed.
         """
         policy, plan = self.policies[self.referee.live], self.steps["plan"]
-        present = policy.state_dict()
-        if any(equal(flight.weights, present) for flight in self.belief.flown):
-            return False
-        if not self.belief.corrects or not self.belief.contradicted:
+        tried = any(equal(flight.weights, policy.state_dict()) for flight in self.belief.flown)
+        if tried or not self.belief.corrects or not self.belief.contradicted:
             return False
         best = self.belief.best_flown(policy, self.virtual.draw(plan.counts[1]))
         if best is not None:

@@ -24,22 +24,12 @@ from test_run_folder import Bomb
 
 from rt_torchrl.runs import run_folder
 from rt_torchrl.runs.run_folder import load_tensors, plain, save_tensors
+from rt_torchrl.steps.belief import equal
 
 pytestmark = pytest.mark.training
 
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""
-
-
-def same(one, other):
-    """Whether two contents of a checkpoint are the same, in whatever order their keys stand."""
-    if isinstance(one, torch.Tensor):
-        return one.dtype == other.dtype and torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return type(one) is type(other) and all(map(same, one, other)) and len(one) == len(other)
-    return one == other
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +76,7 @@ def require_resumed(server, folder, undisturbed, plant=None, **options):
     process.join()
     assert process.exitcode == 0 and deterministic(folder) == undisturbed[1]
     assert not list(folder.glob(".*.partial"))
-    assert same(*(load_tensors(path / "weights.pt") for path in (folder, undisturbed[0])))
+    assert equal(*(load_tensors(path / "weights.pt") for path in (folder, undisturbed[0])))
 
 
 STOPS = [("kill", None, 40), ("terminate", None, 20)]
@@ -185,7 +175,7 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_goes_on(kept, number
             newest.unlink()
             assert len(run_folder.load_checkpoint(tmp_path, algorithm)) == EPISODES - 1
         # Damage may have no effect on the content.
-        assert same(plain(algorithm.state_dict()), states[bool(refusal)])
+        assert equal(plain(algorithm.state_dict()), states[bool(refusal)])
         assert not trace.exists()
 
 
@@ -194,7 +184,7 @@ def test_from_an_earlier_checkpoint_the_training_is_the_same_to_the_bit(tmp_path
     shutil.copytree(whole, again, ignore=shutil.ignore_patterns("w*", "checkpoint-0005.pt", "checkpoint-0004.pt"))
     small_run(again, episodes=EPISODES, resume=True, **QUICK).train()
     assert deterministic(again) == deterministic(whole)
-    assert same(*(load_tensors(folder / "weights.pt") for folder in (again, whole)))
+    assert equal(*(load_tensors(folder / "weights.pt") for folder in (again, whole)))
 
 
 def test_a_full_disk_stops_with_what_was_done_saved_and_says_so(tmp_path, monkeypatch, capsys):

@@ -136,6 +136,13 @@ def test_cost_counts_speed_and_power_errors():
     assert cost.item() == pytest.approx(0.5 * (2.0 * 0.01 + 3.0 * 0.04), rel=1e-12)
 
 
+def test_a_turbine_with_other_constants_has_what_follows_from_them():
+    class Slower(WindTurbine):
+        rated_rotor_speed, standstill_tip_speed_ratio = 1.0, 3.0
+
+    assert Slower().revolution == 2.0 * math.pi and Slower().least_tip_speed_ratio == 1.5
+
+
 def test_error_integral_is_an_exponential_window_of_one_revolution():
     """At constant e_1 the window gives e_2 = e_1(1 − e^{−t/T_r}), T_r = 2π/ω_rated."""
     plant = WindTurbine(horizon=60.0, inertia=FROZEN)

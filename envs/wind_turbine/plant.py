@@ -149,7 +149,6 @@ class WindTurbine(Plant):
     rated_power = 5e6  # P_N [W], electrical; at the shaft the rated torque and speed make 5.297 MW
     generator_efficiency = rated_power / (RATED_TORQUE * RATED_GENERATOR_SPEED)  # 94.4 %
     rated_rotor_speed = RATED_ROTOR_SPEED
-    revolution = 2.0 * math.pi / rated_rotor_speed  # T_r [s]
     rated_wind_speed = 11.4  # [m/s]
     rated_generator_speed = RATED_GENERATOR_SPEED
     minimum_generator_speed = 70.16  # 670 rpm [rad/s]
@@ -158,7 +157,6 @@ class WindTurbine(Plant):
     cut_in_generator_speed = 20.0  # middle of the band in which the torque sets in [rad/s]; ours, the paper has none
     cut_in_band = 10.0  # half width of that band [rad/s]
     standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]; ours
-    least_tip_speed_ratio = 0.5 * standstill_tip_speed_ratio  # λ below which the torque, which has faded, divides by it
     rate_limits = (TORQUE_RATE, 8.0)  # greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators
 
     states: tuple[Signal, ...] = STATES
@@ -258,6 +256,17 @@ class WindTurbine(Plant):
         rates = torch.stack([acceleration, *filters, integral, held, held], -1)
         # The fast filter is the seventh state, or there is none.
         return torch.cat([rates, FAST_FILTER * (omega_g.unsqueeze(-1) - state[..., 6:])], -1)
+
+    # Computed of other constants, so that a turbine with others of these has its own.
+    @property
+    def revolution(self) -> float:
+        """Time T_r of a revolution at rated speed [s]."""
+        return 2.0 * math.pi / self.rated_rotor_speed
+
+    @property
+    def least_tip_speed_ratio(self) -> float:
+        """λ below which the torque divides by this one [-]; it has faded there."""
+        return 0.5 * self.standstill_tip_speed_ratio
 
     def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
         r"""Torque τ_a = ½ρπR³(C_p/λ)u² [N m], which fades to zero over λ < 1 (standstill), where no closure is defined.

@@ -22,7 +22,6 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SmoothClip
-from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.code import IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.native import Native
@@ -49,9 +48,9 @@ class PenalisedInterval(nn.Module):
     def __init__(self, plant: Plant, closure: nn.Module):
         super().__init__()
         self.plant, self.closure = plant, closure
-        low, high = bounds(plant.actions)
-        self.low = nn.Buffer(low)
-        self.span = nn.Buffer(high - low)
+        ranges = SmoothClip(plant.actions)  # which refuses infinite ones
+        self.low = ranges.low
+        self.span = nn.Buffer(ranges.high - ranges.low)
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """State and cost, (s, J), at the end of the interval."""
@@ -82,14 +81,13 @@ class CommandCost:
 
     def __init__(self, plant: Plant, closure: nn.Module, n: int, *, hold: int = 1):
         require_double("closure", closure)
-        SmoothClip(plant.actions)  # which refuses infinite ranges
+        self.interval = PenalisedInterval(plant, closure)
         if plant.end_cost is not None:
             raise ValueError(
                 f"episodes of plant {plant.name!r} may end early, which optimal commands do not consider: leave out "
                 "model predictive control."
             )
         self.plant, self.n, self.hold = plant, n, hold
-        self.interval = PenalisedInterval(plant, closure)
         self._first = np.arange(0, n, hold)
         self._code: IntervalCode | None = None
 

@@ -125,8 +125,7 @@ class Run:
             simulated = functools.partial(run_start.simulated, plant, config, first, device=self.device)
             make_env, system = None if isinstance(env, RealSystem) else env or simulated, self._real or simulated()
             self._system, make_learner = system, learner or functools.partial(ActorCritic, replay=replay)
-            self._makers = make_learner, planner, referee, collector
-            self._make_algorithm(system, make_env, physics)
+            self._make_algorithm(system, make_env, physics, (make_learner, planner, referee, collector))
             self.unseen = run_start.judged_on(plant, self.algorithm.twin, self._real, self.config, device=self.device)
             self.baselines = {name: law.to(self.device) for name, law in controllers.items()}
             self.episodes: list[dict[str, Any]] = []
@@ -142,8 +141,14 @@ class Run:
             self._held.release()
             raise
 
-    def _make_algorithm(self, env: EnvBase | Operation, make_env: Callable[[], EnvBase] | None, physics: Plant) -> None:
-        config, (make_learner, planner, referee, collector) = self.config, self._makers
+    def _make_algorithm(
+        self,
+        env: EnvBase | Operation,
+        make_env: Callable[[], EnvBase] | None,
+        physics: Plant,
+        makers: tuple[Callable[..., Learner], MakePlanner, MakeReferee, MakeCollector],
+    ) -> None:
+        config, (make_learner, planner, referee, collector) = self.config, makers
         generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, physics)
         policies = {role: policy.to(self.device) for role, policy in config.make_policies(physics, generator).items()}

@@ -35,7 +35,6 @@ from scipy.optimize import minimize
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.plants.shapes import Actions
 from rt_torchrl.plants.signal import bounds
@@ -484,7 +483,7 @@ class Belief:
                 f"the weights that have just flown on the real system; the closure is {type(twin.closure).__name__}."
             )
         if self.corrects:
-            self.anchors()
+            self.anchors()  # raises where the twin diverges within an interval from what was read
 
     def state_dict(self) -> dict[str, Any]:
         return {"flights": [f._asdict() | {"trajectory": f.trajectory._asdict()} for f in (*self.first, *self.flown)]}
@@ -531,9 +530,16 @@ def alarm(differences: Sequence[float]) -> str | None:
     return f"the twin is wrong where it matters: the latest real costs ({n}) were {ratio:.3g} times what it says"
 
 
-def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether two states, of a twin or of a policy, are the same."""
-    (leaves, structure), (other_leaves, other_structure) = tree_flatten(dict(state)), tree_flatten(dict(other))
-    return structure == other_structure and all(
-        torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(leaves, other_leaves, strict=True)
-    )
+def equal(state: Any, other: Any) -> bool:
+    """Whether two states, of a twin or of a policy, are the same, whatever mappings hold them in whatever order."""
+    if isinstance(state, Tensor):
+        return isinstance(other, Tensor) and state.dtype == other.dtype and torch.equal(state, other)
+    if isinstance(state, Mapping):
+        return (
+            isinstance(other, Mapping)
+            and state.keys() == other.keys()
+            and all(equal(value, other[key]) for key, value in state.items())
+        )
+    if isinstance(state, list | tuple):
+        return type(state) is type(other) and len(state) == len(other) and all(map(equal, state, other))
+    return bool(state == other)

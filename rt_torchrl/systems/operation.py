@@ -325,14 +325,17 @@ class Operation:
                 "policies and systems that pickle."
             ) from error
         self.system, self.version = system, -1
-        self.closure: nn.Module | None = system.closure
-        """The true closure of the system, as far as it is known."""
         self.orders: dict[int, Order] = {}
         self.report: SafetyReport | None = None
         self.acted: Mapping[str, float] | None = None
         self._state: dict[str, Any] | None = None
         self._connection: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
+
+    @property
+    def closure(self) -> nn.Module | None:
+        """The true closure of the system, as far as it is known."""
+        return cast(nn.Module | None, self.system.closure)
 
     def hand_over(
         self, name: str, policy: nn.Module, *, strength: float, report: dict[str, float | str] | None = None
