@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-NOTICE = b"\ninterrupted: the training stops after the iteration under way (once more to leave at once)\n"
+NOTICE = b"\ninterrupted: the training or its flights stop after the iteration under way (once more to leave at once)\n"
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -39,10 +39,13 @@ class Interruption:
                     self._before[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
         Interruption._pending = False
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        if self.at_once and error is not None and not isinstance(error, KeyboardInterrupt):
+            # Torch and TorchRL may have turned the KeyboardInterrupt into another error.
+            raise KeyboardInterrupt from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if Interruption._pending:

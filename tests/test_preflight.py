@@ -177,6 +177,7 @@ MISTAKES = {
     "all in mm": (LEVELS, {"scale": 1000.0}, "all states in m are in mm, where the plant has m"),
     "one cable": (LEVELS, {"order": [0, 1, 0, 3]}, "state level_1 and state level_3 have the same readings"),
     "set points in cm": (LEVELS, read("exogenous", scale=100.0), "input set_point_1 is read between 10"),
+    "still set points": (LEVELS, read("exogenous", scale=0.0, offset=0.2), "input set_point_1 stands still at 0.2 m"),
     "tiny set points": (LEVELS, read("exogenous", scale=0.001), "input set_point_1 is read between 0.0001"),
     "set points from levels": (
         LEVELS,

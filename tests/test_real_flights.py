@@ -31,7 +31,7 @@ class Machine(Rig):
 
     def __init__(self, plant, **options):
         super().__init__(plant, **options)
-        self.resets, self.flights, self.costs, self.fails_at = 0, [], [], None
+        self.resets, self.flights, self.costs, self.fails_at, self.interrupted_in = 0, [], [], None, None
 
     def _reset(self, tensordict=None, **kwargs):
         self.resets += 1
@@ -41,6 +41,9 @@ class Machine(Rig):
         if self.count == 0:
             self.flights.append([])
             self.costs.append(0.0)
+        if self.interrupted_in is not None and len(self.flights) > self.interrupted_in:
+            self.interrupted_in = None
+            signal.raise_signal(signal.SIGINT)
         if self.count == self.fails_at:
             raise ConnectionError("no answer")
         s, z, plant = self.found["state"], self.found["exogenous"], self.inner.plant
@@ -253,6 +256,21 @@ def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
     paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]
     assert len(rig.flights) == 2 + 2 + 2 * 2 == paid["episodes"]
     assert paid["sum"] == pytest.approx(sum(rig.costs), rel=1e-9)
+
+
+@pytest.mark.parametrize("whole", [1, 3])
+def test_an_interrupt_of_the_judging_flights_leaves_the_results_and_the_controllers_that_have_flown(tmp_path, whole):
+    rig = machine()
+
+    def press(episodes):
+        if len(episodes) == 2:
+            rig.interrupted_in = len(rig.flights) + whole
+
+    metrics = run_on(rig, tmp_path, real_unseen=2, baselines={"PD": PD}, callbacks=[press]).train()
+    summary = metrics["summary"]
+    flown = summary.get("real_unseen", {"controllers": {}})["controllers"]
+    assert [*flown] == ([summary["live"]] if whole == 3 else []) and len(rig.flights) == 2 + whole + 1
+    assert (tmp_path / "metrics.json").is_file()
 
 
 def test_after_an_interrupt_nothing_flies(tmp_path):

@@ -189,7 +189,8 @@ class Run:
         """Train, evaluate and write the results.
 
         Ctrl-C or SIGTERM ends the training after the present iteration; the evaluation then takes the episodes done so
-        far. A second one, or one after the training, ends the run at once; the run can then be resumed.
+        far. In flights of the real system that follow, it ends these. A second one, or one elsewhere after the training,
+        ends the run at once; the run can then be resumed.
 
         Returns:
             Content of ``metrics.json``.
@@ -271,11 +272,8 @@ class Run:
                     if self.ended is not None:
                         bar.write(f"ended after {len(self.episodes)} episodes: {self.ended}")
                         break
-            except BaseException as error:
+            except KeyboardInterrupt:
                 if interruption.at_once:
-                    # Torch and TorchRL may have turned the KeyboardInterrupt into another error.
-                    raise KeyboardInterrupt from error
-                if not isinstance(error, KeyboardInterrupt):
                     raise
                 bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to end at once)")
 
@@ -322,11 +320,17 @@ class Run:
         episodes = RealEpisodes(self._system, count, device=self.device)
         episodes.bounds = self.unseen.bounds
         flights = dict[str, Trajectory]()
-        for name, law in laws.items():
-            try:
-                flights[name] = episodes.fly(law)
-            except ValueError as error:  # the system has ended an episode; the results of the training stay
-                bar.write(f"{name} is not judged on the real system: {error}")
+        with Interruption() as interruption:
+            for name, law in laws.items():
+                try:
+                    flights[name] = episodes.fly(law)
+                except ValueError as error:  # the system has ended an episode; the results of the training stay
+                    bar.write(f"{name} is not judged on the real system: {error}")
+                except KeyboardInterrupt:
+                    if interruption.at_once:
+                        raise
+                    bar.write(f"interrupted: judged on the real system: {', '.join(flights) or 'no controller'}")
+                    break
         if not flights:
             return None
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}

@@ -36,7 +36,8 @@ def progress(record: dict[str, Any]) -> str:
     named = {"J_a mb": "J_a_model_based", "J_a mf": "J_a_model_free", "real": "real_cost"}
     named["there the first controller on the twin"] = "J_a_first"
     costs = [f"{name} {in_words(record[key])}" for name, key in named.items() if record.get(key) is not None]
-    return ", ".join([*rms_words(errors)[:MOST_ERRORS], *costs, f"live {record['live'].replace('_', '-')}"])
+    early = [f"ended after {record['ended_after']:.0f} intervals"] if "ended_after" in record else []
+    return ", ".join([*rms_words(errors)[:MOST_ERRORS], *costs, *early, f"live {record['live'].replace('_', '-')}"])
 
 
 def rms_words(errors: dict[str, float | None]) -> list[str]:

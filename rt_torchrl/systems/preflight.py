@@ -181,7 +181,7 @@ def check_real_system(
     The real system flies ``STARTS`` times ``INTERVALS`` control intervals, with noise on the commands, because what
     does not move shows nothing. The sequence of its episodes then goes on as if nothing had been flown. A reading that
     stands still where the twin moves by more than ``RESOLUTION`` is a mistake, too, as are two signals with the same
-    readings, and an input far outside what ``plant.draw_exogenous`` draws.
+    readings, and an input far outside what ``plant.draw_exogenous`` draws, or still where every draw changes.
 
     Args:
         env: the real system, of batch size 1.
@@ -299,11 +299,17 @@ def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]
 
 
 def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which inputs are read far outside what the plant draws, or at a small share of it."""
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
+    """Which inputs are read far outside what the plant draws, at a small share of it, or as one value for all times."""
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
+    seen = 1 + round(float(flown.t.max()) / plant.dt)
     for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
         if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
             yield f"input {signal.name} is read {_beside(signal, read, course)}"
+        elif (read == read.flatten()[0]).all() and (course[:, :seen] != course[:, :1]).any(-1).all():
+            yield (
+                f"the reading of input {signal.name} stands still at {read.max():.4g} {signal.unit}, which in every "
+                "draw of the plant changes meanwhile"
+            )
 
 
 def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
