@@ -6,6 +6,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
+from test_classical import PD
 from torch import nn
 
 from rt_torchrl import shipped_plants
@@ -68,6 +69,11 @@ REFUSED = {
     "another number of observations": (lambda law, e: e @ law.gain.repeat(2, 1), r"cannot take float64 .*\(3, 2\)"),
     "no number": (lambda law, e: (e @ law.gain - 1e300).exp().log(), "actions that are not finite"),
 }
+
+
+def test_a_classical_controller_is_refused_in_words(tmp_path):
+    with pytest.raises(ValueError, match="PD has no forward.observation., as classical and predictive controllers"):
+        export_onnx(PD(LinearQuadratic()), tmp_path / "policy.onnx", LinearQuadratic())
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -109,6 +109,8 @@ def test_what_is_saved_is_read_back(tmp_path):
     with pytest.raises(ValueError, match=r"\['real_system'\]\['rng'\]\[1\] of what is to be saved is a ndarray"):
         save_tensors(file, {"real_system": {"rng": [0, np.zeros(2)]}})
     assert [path.name for path in tmp_path.iterdir()] == ["weights.pt"] and equal(load_tensors(file), expected)
+    save_tensors(file, {"part": torch.zeros(1_000_000)[:10]})
+    assert file.stat().st_size < 10_000  # the tensor alone, without what it is a slice of
 
 
 class Bomb:

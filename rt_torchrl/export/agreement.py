@@ -54,6 +54,11 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     try:
         actions, again = policy(observations), policy(observations)
         kind, shape = actions.dtype, tuple(actions.shape)
+    except NotImplementedError as error:
+        raise ValueError(
+            f"{name} has no forward(observation), as classical and predictive controllers have none, which act from "
+            "states, inputs and a memory; only a policy, a function of the observation, can be exported."
+        ) from error
     except Exception as error:  # any error of the user's module
         raise ValueError(
             f"policy {name} cannot take float64 observations of shape {tuple(observations.shape)} of plant "

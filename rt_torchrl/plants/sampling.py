@@ -73,7 +73,7 @@ def whole_multiple(argument: str, seconds: float, unit: float) -> int:
     Raises:
         ValueError: if the time is no whole multiple of the unit.
     """
-    count = round(seconds / unit)
+    count = round(seconds / unit) if math.isfinite(seconds) else 0
     if count < 1 or abs(count * unit - seconds) > 1e-6 * unit:
         nearest = max(1, count) * unit
         raise ValueError(f"{argument}={seconds} s must be a whole multiple of {unit:.9g} s, such as {nearest:.9g} s.")

@@ -65,7 +65,8 @@ def plain(value: Any, place: str = "") -> Any:
         ValueError: if it holds anything but tensors, numbers and strings; it names the place.
     """
     if isinstance(value, torch.Tensor):
-        return value.detach().cpu().as_subclass(torch.Tensor)
+        # torch.save writes the whole storage of a tensor, of which a slice of a rollout is a small part.
+        return value.detach().cpu().as_subclass(torch.Tensor).clone()
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
