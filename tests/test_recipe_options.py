@@ -35,7 +35,7 @@ def test_the_paper_is_one_option(plant):
     row = getattr(made, f"PAPER_{ROWS[plant]}")
     usual = of_command_line(plant)
     assert paper.twinning == row != made.DEFAULT == usual.twinning
-    assert [config.effective().twinning.exploration.noise for config in (usual, paper)] == [0.02, 0.2]
+    assert [config.effective().twinning.exploration.noise for config in (usual, paper)] == [0.0, 0.2]
     spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
     assert dataclasses.replace(spelled, preset="paper", observe=(), twinning=row) == paper
     assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost

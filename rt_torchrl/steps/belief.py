@@ -207,15 +207,18 @@ class Belief:
         return deviation.unsqueeze(0) if (deviation.abs() > ROUNDING * (high - low)).any() else None
 
     @torch.no_grad()
-    def beside_first(self, policy: nn.Module, controller: nn.Module | None) -> tuple[float, float] | None:
+    def beside_first(
+        self, policy: nn.Module, controller: nn.Module | None, others: Scenario | None = None
+    ) -> tuple[float, float] | None:
         """The cost that is expected of a policy in the episodes of the controller that flew first, and what these cost.
 
         Before a policy has flown nothing corrects what the twin says of one. It then errs as it errs for the
-        controller, which it flies in the same episodes.
+        controller, which it flies in the same episodes, and in others, because one flight holds no rare end.
 
         Args:
             policy: the policy.
             controller: the controller; None where no controller flew first.
+            others: the other episodes, if there are any.
 
         Returns:
             None where no controller flew first or it cost nothing, the twin alone has the word, or the policy is state
@@ -225,6 +228,8 @@ class Belief:
         if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
         episodes = [self.virtual.repeated(flight.trajectory) for flight in self.first]
+        if others is not None and not self.flown:
+            episodes.append(others)
 
         def on_twin(module: nn.Module) -> float:
             return sum(self.virtual.cost(module, episode) for episode in episodes) / len(episodes)

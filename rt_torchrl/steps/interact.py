@@ -217,28 +217,37 @@ class Supervisor:
             ValueError: if nothing may act.
         """
         episodes, refused, report = self.episodes(), list[str](), dict[str, float | str]()
+        checked = episodes if self.limits is not None else None
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
             if not reason:
-                if episodes is not None:
+                if checked is not None:
                     self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
                     report["predicted_violations"] = share
                 return policy, role, report
             refused.append(reason)
             report["reason"] = "; ".join(refused)
-        if self._last is not None and episodes is not None:
+        if self._last is not None and checked is not None:
             role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
             policy.load_state_dict(self._last["weights"])
-            return policy, role, report | {"predicted_violations": self.predicted(policy, episodes)}
+            return policy, role, report | {"predicted_violations": self.predicted(policy, checked)}
         if self.controller is not None:
             return self.controller, FIRST, report
         raise ValueError(f"no policy may act. {report['reason']}. Widen the limits, or use --start controller.")
 
     def episodes(self) -> Scenario | None:
-        """Virtual episodes in which the limits are checked; None without limits, and before anything is known."""
-        virtual = self.belief.virtual
-        return virtual.draw(self.count) if self.limits is not None and virtual.processes else None
+        """Virtual episodes in which limits are checked, and policies that have not flown beside the controller.
+
+        None without either, and before anything is known.
+        """
+        virtual, untried = self.belief.virtual, self.controller is not None and not self.belief.flown
+        if not virtual.processes or not (untried or self.limits is not None):
+            return None
+        state = virtual.generator.get_state()
+        drawn = virtual.draw(self.count)
+        virtual.generator.set_state(state)  # so that a training in which all may act is the same without the check
+        return drawn
 
     @torch.no_grad()
     def refusal(self, role: Role, episodes: Scenario | None) -> tuple[str, float]:
@@ -249,10 +258,10 @@ class Supervisor:
             episodes: see :meth:`episodes`.
         """
         policy = self.policies[role]
-        share = 0.0 if episodes is None else self.predicted(policy, episodes)
+        share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
-        known = self.belief.beside_first(policy, self.controller)
+        known = self.belief.beside_first(policy, self.controller, episodes)
         if known is None or known[0] <= TWICE * known[1]:
             return "", share
         expected, paid = map(in_words, known)

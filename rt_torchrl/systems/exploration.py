@@ -13,7 +13,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
-OF_RANDOM_WEIGHTS, OF_IMITATIONS = 0.2, 0.02
+OF_RANDOM_WEIGHTS, OF_IMITATIONS = 0.2, 0.0
 """Spread of the noise around random weights, and around policies that imitate a controller."""
 HANDOVER = 20
 """Number n of control intervals in which an offset of a handover as wide as the range of the action fades."""
