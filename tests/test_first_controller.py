@@ -115,9 +115,19 @@ def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
     ratio = on_twin(found.model_based) / on_twin(found.first.teacher)
     expected = pytest.approx((paid * ratio, paid))
     assert found.belief.beside_first(found.model_based, found.first.teacher) == expected
+    supervisor, before = found.steps["interact"].supervisor, found.generator.get_state()
+    others = supervisor.episodes()  # one flight holds no rare end
+    assert torch.equal(found.generator.get_state(), before)
+    costs = [
+        on_twin(policy) + control_cost(found.twin.plant, found.twin.control(policy, *others)).mean().item()
+        for policy in (found.model_based, found.first.teacher)
+    ]
+    expected = pytest.approx((paid * costs[0] / costs[1], paid))
+    assert found.belief.beside_first(found.model_based, found.first.teacher, others) == expected
     found.belief.append(record, "model_based", paid)
-    corrected = found.belief.expected(found.model_based, on_twin(found.model_based))
-    assert found.belief.beside_first(found.model_based, found.first.teacher) == pytest.approx((corrected, paid))
+    assert supervisor.episodes() is None
+    corrected = pytest.approx((found.belief.expected(found.model_based, on_twin(found.model_based)), paid))
+    assert found.belief.beside_first(found.model_based, found.first.teacher, others) == corrected
 
 
 def test_a_controller_whose_costs_have_no_ratio_is_named():

@@ -13,8 +13,8 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
-OF_RANDOM_WEIGHTS, OF_IMITATIONS = 0.2, 0.0
-"""Spread of the noise around random weights, and around policies that imitate a controller."""
+OF_RANDOM_WEIGHTS = 0.2
+"""Spread of the noise around random weights."""
 HANDOVER = 20
 """Number n of control intervals in which an offset of a handover as wide as the range of the action fades."""
 
@@ -31,8 +31,9 @@ class ExplorationConfig:
 
     Args:
         spread: standard deviation of the noise on each action, as a share of half its range, in the first episode; by
-            default 0.2, or 0.02 where a training begins with a controller, a log or an earlier one: a real system that
-            a controller has held so far need not meet the noise that finds out what actions do at all.
+            default 0.2, or none where a training begins with a controller, a log or an earlier one: a real system that
+            a controller has held so far need not meet the noise that finds out what actions do at all, and a policy
+            beside a limit may leave it by noise.
         episodes: number of episodes until ξ is zero; with 0 no episode explores.
         correlation_time: correlation time τ of the noise [s]; 0 makes the noise new at each control interval, as in
             the paper.
@@ -51,8 +52,8 @@ class ExplorationConfig:
         return OF_RANDOM_WEIGHTS if self.spread is None else self.spread
 
     def imitating(self) -> "ExplorationConfig":
-        """The same noise in a training that does not begin with random weights."""
-        return self if self.spread is not None else dataclasses.replace(self, spread=OF_IMITATIONS)
+        """The noise in a training that does not begin with random weights: what is given, or none."""
+        return self if self.spread is not None else dataclasses.replace(self, spread=0.0)
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""
