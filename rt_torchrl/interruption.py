@@ -39,7 +39,7 @@ class Interruption:
                     self._before[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         Interruption._pending = False
         for number, handler in self._before.items():
             signal.signal(number, handler)

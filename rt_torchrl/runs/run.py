@@ -189,8 +189,8 @@ class Run:
         """Train, evaluate and write the results.
 
         Ctrl-C or SIGTERM ends the training after the present iteration; the evaluation then takes the episodes done so
-        far. In flights of the real system that follow, it ends these. A second one, or one elsewhere after the training,
-        ends the run at once; the run can then be resumed.
+        far. It ends flights of the real system that follow, too. A second one, or one elsewhere after the training, ends
+        the run at once; the run can then be resumed.
 
         Returns:
             Content of ``metrics.json``.
@@ -319,6 +319,21 @@ class Run:
         bar.doing("judging on the real system")
         episodes = RealEpisodes(self._system, count, device=self.device)
         episodes.bounds = self.unseen.bounds
+        flights = self._real_flights(episodes, laws, bar)
+        if not flights:
+            return None
+        judged = {name: episodes.judge(flown) for name, flown in flights.items()}
+        entry = results.entries(episodes.plant, flights, judged, live)
+        self._paid += [cost for costs in entry["costs"].values() for cost in costs]
+        if live in flights:
+            J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
+            entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}
+        return entry
+
+    def _real_flights(
+        self, episodes: RealEpisodes, laws: Mapping[str, nn.Module], bar: Progress
+    ) -> dict[str, Trajectory]:
+        """The flights of each controller, without those that fail, and without what comes after Ctrl-C."""
         flights = dict[str, Trajectory]()
         with Interruption() as interruption:
             for name, law in laws.items():
@@ -331,15 +346,7 @@ class Run:
                         raise
                     bar.write(f"interrupted: judged on the real system: {', '.join(flights) or 'no controller'}")
                     break
-        if not flights:
-            return None
-        judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        entry = results.entries(episodes.plant, flights, judged, live)
-        self._paid += [cost for costs in entry["costs"].values() for cost in costs]
-        if live in flights:
-            J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
-            entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}
-        return entry
+        return flights
 
     def _written(self, summary: dict[str, Any], judged: Mapping[str, Judged], judging: float) -> dict[str, Any]:
         """Write ``weights.pt`` and ``metrics.json``, whose content is returned."""
