@@ -189,8 +189,8 @@ class Run:
         """Train, evaluate and write the results.
 
         Ctrl-C or SIGTERM ends the training after the present iteration; the evaluation then takes the episodes done so
-        far. It ends flights of the real system that follow, too. A second one, or one elsewhere after the training, ends
-        the run at once; the run can then be resumed.
+        far. It ends flights of the real system that follow, too. A second one, or one elsewhere after the training,
+        ends the run at once; the run can then be resumed.
 
         Returns:
             Content of ``metrics.json``.
