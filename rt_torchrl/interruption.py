@@ -7,7 +7,9 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-NOTICE = b"\ninterrupted: the training or its flights stop after the iteration under way (once more to leave at once)\n"
+NOTICE = (
+    b"\ninterrupted: a training stops after the iteration under way, a flight at once (once more to leave at once)\n"
+)
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -270,7 +270,13 @@ def test_an_interrupt_of_the_judging_flights_leaves_the_results_and_the_controll
     summary = metrics["summary"]
     flown = summary.get("real_unseen", {"controllers": {}})["controllers"]
     assert [*flown] == ([summary["live"]] if whole == 3 else []) and len(rig.flights) == 2 + whole + 1
-    assert (tmp_path / "metrics.json").is_file()
+    # What has flown is paid, and stays so when other flights end earlier still, which leave what was known.
+    paid = summary["cost_of_learning"]
+    assert paid["judging"] == pytest.approx(rig.costs[2:-1], rel=1e-9) and paid["episodes"] == 2 + whole
+    rig.interrupted_in = len(rig.flights) + 1
+    again = run_on(rig, tmp_path, real_unseen=3, baselines={"PD": PD}, resume=True).train()["summary"]
+    assert again.get("real_unseen") == summary.get("real_unseen")
+    assert again["cost_of_learning"]["episodes"] == 2 + whole + 1
 
 
 def test_after_an_interrupt_nothing_flies(tmp_path):

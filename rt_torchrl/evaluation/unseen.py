@@ -260,6 +260,8 @@ class RealEpisodes(UnseenEpisodes):
         super().__init__(system.plant, count, device=device)
         self.closure = None
         self._system, self._count = system, count
+        self.paid: list[float] = []
+        """J_a of each flight, also of those before a failure or an interrupt."""
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
@@ -274,18 +276,23 @@ class RealEpisodes(UnseenEpisodes):
         from rt_torchrl.systems.collectors import collector_of
 
         if isinstance(policy, RealController):
-            return policy.fly_real(self._count, seed=UNSEEN_SEED)
+            whole = policy.fly_real(self._count, seed=UNSEEN_SEED)
+            self.paid += control_cost(self.plant, whole).tolist()
+            return whole
         generator = torch.Generator(device=self.initial_state.device)
         actor = LivePolicy(self.plant, policy, ExplorationConfig(), generator=generator)
         rollout = collector_of(self._system, actor, self.plant).rollout
         flights = RealFlights(self._system, actor, rollout, self.plant)
         state = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
+        flown = list[Trajectory]()
         try:
-            flown = [flights.fly(policy, strength=0.0, whole=True).record for _ in range(self._count)]
+            for _ in range(self._count):
+                flown.append(self._to_the_horizon(flights.fly(policy, strength=0.0, whole=True).record))
+                self.paid += control_cost(self.plant, batch_of(flown[-1:])).tolist()
         finally:
             self._system.load_state_dict(state)
-        return batch_of([self._to_the_horizon(record) for record in flown])
+        return batch_of(flown)
 
     def _to_the_horizon(self, record: Trajectory) -> Trajectory:
         """A record of an episode; one that ended early stays in the state in which it ended."""

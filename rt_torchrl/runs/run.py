@@ -297,34 +297,34 @@ class Run:
         dashboard.episode(record)
 
     def _fly_the_real_system(self, bar: Progress) -> dict[str, Any] | None:
-        """The entry ``real_unseen`` of the summary, if flights of the real system were asked for.
+        """The entry ``real_unseen`` of the summary; that of an earlier end, unless other flights are asked for.
 
         Before the first flight the run says how many of whom. Who has pressed Ctrl-C does not want the system to go on.
         """
         count, live = self.config.real_unseen, self.algorithm.referee.live
         interrupted = len(self.episodes) < self.config.episodes and self.ended is None
-        if not count:
-            return None
+        earlier = results.judged_before(self.folder, len(self.episodes))
+        if not count or interrupted:
+            return earlier
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
         if reason := results.grounded(self.config, self.algorithm, self.initial_policies):
             bar.write(f"the live policy does not fly the real system: {reason}")
             del laws[live]
-        if earlier := results.judged_before(self.folder, len(self.episodes), laws, count):
+        flown = {} if earlier is None else {name: law["episodes"] for name, law in earlier["controllers"].items()}
+        if earlier is not None and flown == dict.fromkeys(laws, count):
             bar.write("the real system has been flown after these episodes; it is not flown again")
             return earlier
-        if interrupted:
-            return None
         names = ", ".join(f"{count} of {name}" for name in laws)
         bar.write(f"{count * len(laws)} flights on the real system, which count as paid: {names}")
         bar.doing("judging on the real system")
         episodes = RealEpisodes(self._system, count, device=self.device)
         episodes.bounds = self.unseen.bounds
         flights = self._real_flights(episodes, laws, bar)
+        self._paid += episodes.paid
         if not flights:
-            return None
+            return earlier
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
         entry = results.entries(episodes.plant, flights, judged, live)
-        self._paid += [cost for costs in entry["costs"].values() for cost in costs]
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
             entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}

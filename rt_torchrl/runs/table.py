@@ -113,7 +113,8 @@ def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
     line, last = f"  live at the end: {live.replace('_', '-')}", episodes[-1]
     if f"expected/{live}" in last:
         cost, other = (_number(last[f"expected/{role}"], ".4g") for role in (live, other_than(live)))
-        line += f", expected to cost {cost} on the real system, and {other_than(live).replace('_', '-')} {other}"
+        line += f", expected to cost {cost} on the real system in the last virtual episodes, and"
+        line += f" {other_than(live).replace('_', '-')} {other}"
     judged = [record["update_accepted"] for record in episodes if "update_accepted" in record]
     if judged:
         line += f"; updates of model-free that were kept while it was live: {sum(judged):.0f} of {len(judged)}"

@@ -130,7 +130,8 @@ class Wiring(NamedTuple):
         mistakes: the readings that are wrong by themselves, of which no other wiring is tried: a state that stands
             still where the twin moves, two signals with the same readings, an input far outside its draws; or the
             mistakes that fit much better, the best one first. Empty if the wiring is right or nothing fits.
-        doubts: where no mistake is named, the states of whose movement much is unexplained, in words.
+        doubts: where no mistake is named, states of whose movement much is unexplained or whose starts are strange, and
+            inputs that never change although draws do, in words.
     """
 
     plant: Plant
@@ -142,6 +143,8 @@ class Wiring(NamedTuple):
 
     def __str__(self) -> str:
         rows = [f"one step of {self.plant.dt:g} s of plant {self.plant.name!r} beside the readings:"]
+        rows += [f"  mistake: {mistake}" for mistake in self.mistakes] or ["  no mistake explains the readings better"]
+        rows += [f"  {doubt}" for doubt in self.doubts]
         columns = (self.moved, self.present.share, self.present.error, self.noise)
         for signal, moved, share, error, noise in zip(self.plant.states, *columns, strict=True):
             explained = f"{100.0 * share:.3g} % unexplained" if share.isfinite() else "it does not move"
@@ -149,8 +152,7 @@ class Wiring(NamedTuple):
             rows.append(
                 f"  {signal.name}: moves by {moved:.4g} {signal.unit}, predicted within {error:.4g}; {explained}"
             )
-        rows += [f"  mistake: {mistake}" for mistake in self.mistakes] or ["  no mistake explains the readings better"]
-        return "\n".join([*rows, *(f"  {doubt}" for doubt in self.doubts)])
+        return "\n".join(rows)
 
     def require(self) -> None:
         """Refuse a system whose wiring does not fit, and warn of its doubts.
@@ -181,7 +183,8 @@ def check_real_system(
     The real system flies ``STARTS`` times ``INTERVALS`` control intervals, with noise on the commands, because what
     does not move shows nothing. The sequence of its episodes then goes on as if nothing had been flown. A reading that
     stands still where the twin moves by more than ``RESOLUTION`` is a mistake, too, as are two signals with the same
-    readings, and an input far outside what ``plant.draw_exogenous`` draws, or still where every draw changes.
+    readings, and an input far outside what ``plant.draw_exogenous`` draws. One that never changes, where the draws do,
+    is a doubt.
 
     Args:
         env: the real system, of batch size 1.
@@ -286,6 +289,16 @@ def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterato
                 f"state {signal.name} is read at the start {_beside(signal, read, draws)}: {next(fits, '')}a wrong "
                 "zero, or other starts than those that plans are made for"
             )
+    seen, starts = 1 + round(float(flown.t.max()) / plant.dt), int((flown.t == 0.0).sum())
+    courses = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))[:, :seen]
+    for signal, course, read in zip(plant.inputs, courses.unbind(-1), flown.exogenous.unbind(-1), strict=True):
+        changes, differs = (course != course[:, :1]).any(-1).all(), len(course.unique(dim=0)) == DRAWS
+        if (read == read.flatten()[0]).all() and (changes or (differs and starts > 1)):
+            yield (
+                f"input {signal.name} is always read as {read.max():.4g} {signal.unit}, where "
+                f"{'every draw' if changes else 'one draw after the other'} of the plant changes: a wrong Reading, or "
+                "draws that are none of the real system's"
+            )
 
 
 def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]:
@@ -299,17 +312,11 @@ def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]
 
 
 def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
-    """Which inputs are read far outside what the plant draws, at a small share of it, or as one value for all times."""
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
-    seen = 1 + round(float(flown.t.max()) / plant.dt)
+    """Which inputs are read far outside what the plant draws, or at a small share of it."""
+    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
     for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
         if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
             yield f"input {signal.name} is read {_beside(signal, read, course)}"
-        elif (read == read.flatten()[0]).all() and (course[:, :seen] != course[:, :1]).any(-1).all():
-            yield (
-                f"the reading of input {signal.name} stands still at {read.max():.4g} {signal.unit}, which in every "
-                "draw of the plant changes meanwhile"
-            )
 
 
 def _beside(signal: Signal, read: Tensor, drawn: Tensor) -> str:
