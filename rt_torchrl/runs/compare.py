@@ -316,7 +316,7 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
     from rt_torchrl.figures.style import grid, legend_below
 
     names = list(dict.fromkeys(row.name for comparison in comparisons for row in comparison.rows))
-    columns = min(3, len(comparisons))
+    columns = 2 if len(comparisons) == 4 else min(3, len(comparisons))
     size = (max(6.5, 4.6 * columns), 0.9 + 3.3 * -(-len(comparisons) // columns))
     figure, axes = grid(len(comparisons), columns, title=title, size=size, xlabel="real episodes")
     for ax, comparison in zip(axes, comparisons, strict=True):
