@@ -51,14 +51,14 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     """
     policy = frozen(policy)
     name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
-    try:
-        actions, again = policy(observations), policy(observations)
-        kind, shape = actions.dtype, tuple(actions.shape)
-    except NotImplementedError as error:
+    if type(policy).forward is nn.Module.forward:
         raise ValueError(
             f"{name} has no forward(observation), as classical and predictive controllers have none, which act from "
             "states, inputs and a memory; only a policy, a function of the observation, can be exported."
-        ) from error
+        )
+    try:
+        actions, again = policy(observations), policy(observations)
+        kind, shape = actions.dtype, tuple(actions.shape)
     except Exception as error:  # any error of the user's module
         raise ValueError(
             f"policy {name} cannot take float64 observations of shape {tuple(observations.shape)} of plant "
