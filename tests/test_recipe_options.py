@@ -89,6 +89,15 @@ def test_an_option_that_a_recipe_declares_anew_keeps_what_its_base_allows():
                 read(options)
 
 
+def test_an_option_of_a_recipe_that_hides_a_group_of_options_is_named():
+    @configuration
+    class Logged(RunConfig):
+        log: str = "log.csv"
+
+    with pytest.raises(ValueError, match="log of Logged hides an option of RunConfig; give it another name"):
+        Logged()
+
+
 # What a recipe's command line tells in one line instead of a traceback.
 
 

@@ -130,7 +130,7 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     live = metrics["summary"]["live"]
     cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
 
-    def said(better, controller, planner="multi_start", place="simulation", greatest=0.9, **summary):
+    def said(better, controller, planner="multi_start", place="simulation", greatest=0.9, alarm=0.0, **summary):
         beside = {
             "J_a": {"mean": controller},
             "merit": {},
@@ -139,7 +139,7 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         unseen = metrics["summary"]["unseen"] | {"judged_on": place, "baselines": {"PI": beside}}
         found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
         config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
-        return next_steps({"summary": found}, tmp_path, config)
+        return next_steps({"summary": found, "episodes": [{"alarm": alarm}]}, tmp_path, config)
 
     first = {"expected": 3.0, "paid": 2.0}
     assert "the live policy is not clearly better than PI: keep it" in said(live, 0.5 * cost, greatest=2.1)
@@ -156,8 +156,9 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
         assert ("--real-unseen 5" in said(live, 2.0 * cost, place=place)) == (place != "simulation")
     other = "model_free" if live == "model_based" else "model_based"
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
-    told = said(live, 2.0 * cost, place="twin", first=first)
+    told = said(live, 2.0 * cost, place="twin", first=first, alarm=1.0)
     assert "not clearly better than the controller that flew first: keep it" in told
+    assert "recipes/export.py" in said(live, 2.0 * cost, place="twin", first=first)  # one episode beside twenty
     assert "recipes/export.py" in said(live, 2.0 * cost, place="twin", first={"expected": 2.0, "paid": 3.0})
     assert "recipes/export.py" in said(live, 2.0 * cost, first=first)  # other episodes tell more
     assert said("model_free", math.inf, live="model_free").endswith("--role model_free")

@@ -344,7 +344,8 @@ class Run:
                 except KeyboardInterrupt:
                     if interruption.at_once:
                         raise
-                    bar.write(f"interrupted: judged on the real system: {', '.join(flights) or 'no controller'}")
+                    whole = f"{len(episodes.paid)} flights, which are paid; judged: {', '.join(flights) or 'nobody'}"
+                    bar.write(f"interrupted after {whole}")
                     break
         return flights
 

@@ -125,6 +125,9 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         options.require_checked(type(self))
+        for name, kind in (("log", LogConfig), ("operation", OperationConfig), ("twinning", TwinningConfig)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} of {type(self).__name__} hides an option of RunConfig; give it another name.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.real_unseen == 1:  # no mean of one episode has a confidence interval

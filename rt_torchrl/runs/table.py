@@ -153,7 +153,7 @@ def merit_lines(controllers: Mapping[str, Any], where: str) -> list[str]:
     heading = f"mean (median){where}"
     lines = [f"  {heading:<36}" + "".join(f"{name.replace('_', '-'):>20}" for name in controllers)]
     for name in merits[0]:
-        lines.append(f"    {name:<34}" + "".join(f"{_value(merit[name]):>20}" for merit in merits))
+        lines.append(f"    {name:<34}" + "".join(f" {_value(merit[name]):>19}" for merit in merits))
     return lines
 
 
@@ -193,6 +193,8 @@ def closure_lines(closure: dict[str, Any], errors: dict[str, float | None]) -> l
         lines.append(f"  {label:<22}{row}   {description['meaning']}".rstrip())
     if any(error is None or math.isinf(error) for name, error in errors.items() if name in weights):
         lines.append("  std. error -: the records say nothing of the weight alone, at most of combinations with others")
+    if errors:
+        lines.append("  std. error: of noise alone, not of what the equations lack")
     return lines
 
 
@@ -278,7 +280,9 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
     rival = best if best is not None and not clearly_cheaper(summary, best) else None
-    if rival is None and (twin or best is None) and dearer_than_first(summary):
+    # The few episodes of the controller say less than many on a twin, unless the twin is wrong.
+    wrong = twin and bool(metrics["episodes"][-1].get("alarm"))
+    if rival is None and (wrong or best is None) and dearer_than_first(summary):
         rival = "the controller that flew first"
     if cost is None:
         where = "unseen episodes on the twin" if twin else "unseen episodes"
