@@ -277,8 +277,8 @@ def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterato
     if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
         yield (
             f"the twin leaves {', '.join(much)} unexplained, which is no white noise of a sensor: dynamics that the "
-            "twin lacks, such as a stop or noise that drives it, an angle that jumps by a turn (Signal(periodic=True)), "
-            "or a mistake in a Reading, an Actuation or the plant's equations"
+            "twin lacks, such as a stop or noise that drives it, an angle that jumps by a turn (periodic=True), or a "
+            "mistake in a Reading, an Actuation or the plant's equations"
         )
     drawn = plant.draw_initial_state(STARTS * DRAWS, torch.Generator().manual_seed(0))
     for signal, draws, read in zip(plant.states, drawn.T, flown.states[flown.t == 0.0].T, strict=True):
