@@ -265,6 +265,12 @@ def clearly_cheaper(summary: Mapping[str, Any], name: str) -> bool:
     return greatest is not None and greatest < 1.0 - RELEVANT
 
 
+def clearly_dearer(summary: Mapping[str, Any], name: str) -> bool:
+    """Whether the live policy costs more than a controller on the same episodes, with 95 % confidence."""
+    ratio = judged_at_the_end(summary)[0][name].get("ratio")
+    return ratio is not None and (ratio["confidence_interval"][0] is None or ratio["confidence_interval"][0] > 1.0)
+
+
 def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
@@ -288,11 +294,12 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         where = "unseen episodes on the twin" if twin else "unseen episodes"
         steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
     elif rival is not None:
+        how = "dearer" if rival == best and clearly_dearer(summary, rival) else "not clearly better"
+        larger = "" if config is not None and config.policy == "mlp" else "take --policy mlp, "
         steps.append(
-            f"the live policy is not clearly better than {rival}: keep it, let the policy observe what it computes, "
-            "take --policy mlp, train with more --twinning.planner.iterations, or judge both in more episodes "
-            "(--unseen, --real-unseen); "
-            f"rt_torchrl.diagnose({call}) says why"
+            f"the live policy is {how} than {rival}: keep it, let the policy observe what it computes, "
+            f"{larger}train with more --twinning.planner.iterations, or judge both in more episodes "
+            f"(--unseen, --real-unseen); rt_torchrl.diagnose({call}) says why"
         )
     elif summary["better"] != live:
         steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")
