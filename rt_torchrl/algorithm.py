@@ -39,7 +39,6 @@ from torch.utils._pytree import tree_map_only
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.assimilate import Assimilate, Assimilation
 from rt_torchrl.steps.belief import Belief, equal
@@ -148,8 +147,7 @@ class ReinforcementTwinning(TensorDictSequential):
         flights = RealFlights(env, actor, rollout, twin.plant)
         trained = {role: policy for role, policy in policies.items() if config.arm in ("twinning", role)}
         teacher = None if first is None else first.teacher
-        checked = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else judged
-        supervisor = Supervisor(system, trained, belief, config.limits, checked, teacher)
+        supervisor = Supervisor(system, trained, belief, config.limits, judged, teacher)
         operating = isinstance(env, Operation)
         interact = (Operate if operating else Interact)(flights, supervisor, belief, config)
         assimilation = Assimilation(twin, config.assimilation)

@@ -282,3 +282,11 @@ class PredictiveControl(nn.Module):
         duplicate.load_state_dict(self.state_dict())
         memo[id(self)] = duplicate
         return duplicate
+
+
+def affordable(controller: nn.Module | None, count: int) -> int:
+    """The number of virtual episodes in which a controller flies, of so many that are wanted.
+
+    Every one of model predictive control takes as long as its solves.
+    """
+    return controller.virtual_episodes if isinstance(controller, PredictiveControl) else count

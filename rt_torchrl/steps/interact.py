@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.control.predictive_control import affordable
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import Pilot, Role, TwinningConfig
@@ -217,21 +218,20 @@ class Supervisor:
             ValueError: if nothing may act.
         """
         episodes, refused, report = self.episodes(), list[str](), dict[str, float | str]()
-        checked = episodes if self.limits is not None else None
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
             if not reason:
-                if checked is not None:
+                if self.limits is not None and episodes is not None:
                     self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
                     report["predicted_violations"] = share
                 return policy, role, report
             refused.append(reason)
             report["reason"] = "; ".join(refused)
-        if self._last is not None and checked is not None:
+        if self._last is not None and episodes is not None:
             role, policy = self._last["role"], copy.deepcopy(self.policies[self._last["role"]])
             policy.load_state_dict(self._last["weights"])
-            return policy, role, report | {"predicted_violations": self.predicted(policy, checked)}
+            return policy, role, report | {"predicted_violations": self.predicted(policy, episodes)}
         if self.controller is not None:
             return self.controller, FIRST, report
         raise ValueError(f"no policy may act. {report['reason']}. Widen the limits, or use --start controller.")
@@ -261,7 +261,9 @@ class Supervisor:
         share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
-        known = self.belief.beside_first(policy, self.controller, episodes)
+        few = affordable(self.controller, self.count)
+        others = None if episodes is None else Scenario(*(values[:few] for values in episodes))
+        known = self.belief.beside_first(policy, self.controller, others)
         if known is None or known[0] <= TWICE * known[1]:
             return "", share
         expected, paid = map(in_words, known)

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import affordable
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief, equal
@@ -210,9 +210,7 @@ class Imitation:
         """
         pupils = {role: policy for role, policy in policies.items() if not isinstance(policy, StateFeedback)}
         starts = {role: copy.deepcopy(policy) for role, policy in pupils.items()}
-        # Every virtual episode of model predictive control takes as long as its solves.
-        count = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else self.count
-        judged_on = self.virtual.draw(count) if self.virtual.processes else None
+        judged_on = self.virtual.draw(affordable(teacher, self.count)) if self.virtual.processes else None
         report = metrics()
         for role, policy in pupils.items():
             first = next(other for other, start in starts.items() if clones(start, starts[role]))

@@ -31,6 +31,7 @@ from rt_torchrl.optimisers.levenberg_marquardt import place
 from rt_torchrl.options import OTHER_UNITS
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.shapes import Inputs
 from rt_torchrl.plants.signal import Signal, differences
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.sound_part import sound_part
@@ -243,6 +244,7 @@ def check_records(records: Sequence[Trajectory], plant: Plant, closure: nn.Modul
     """The same of flights that have been flown, such as the first one of a training."""
     fit, flown = _Fit(copy.deepcopy(plant).cpu(), closure), _windows(records, plant, 1)
     present, (moved, moves) = fit.unexplained(flown), fit.movement(flown)
+    inputs = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))
     explained, noise, share = not (present.share > EXPLAINED).any(), torch.zeros_like(moves), present.share
     stuck = ~moves & (present.error > RESOLUTION * (1.0 + flown.states.abs().amax(0)))
     mistakes = [
@@ -250,7 +252,7 @@ def check_records(records: Sequence[Trajectory], plant: Plant, closure: nn.Modul
         for signal, stands in zip(plant.states, stuck, strict=True)
         if stands
     ]
-    mistakes += [*_same_readings(plant, flown, explained), *_strange_inputs(plant, flown)]
+    mistakes += [*_same_readings(plant, flown, explained), *_strange_inputs(plant, inputs, flown)]
     if not mistakes and not explained:
         early = flown.t < (EARLY - 0.5) * plant.dt
         first = flown._replace(**{name: getattr(flown, name)[early] for name in Flown._fields[:6]})
@@ -267,11 +269,11 @@ def check_records(records: Sequence[Trajectory], plant: Plant, closure: nn.Modul
                 left = fit.unexplained(windows)
                 mistakes, _ = _better(fit, windows, left, among=likely)
                 share = left.share
-    doubts = [] if mistakes else _doubts(plant, torch.where(noise, 0.0, share), flown)
+    doubts = [] if mistakes else _doubts(plant, inputs, torch.where(noise, 0.0, share), flown)
     return Wiring(plant, moved, present, noise, tuple(mistakes), tuple(doubts))
 
 
-def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterator[str]:
+def _doubts(plant: Plant, inputs: Inputs, share: Float[Tensor, " n_s"], flown: Flown) -> Iterator[str]:
     """What no mistake explains and may be right all the same."""
     shares = zip(plant.states, share.tolist(), strict=True)
     if much := [f"{100.0 * share:.3g} % of {signal.name}" for signal, share in shares if share > DOUBTFUL]:
@@ -290,8 +292,7 @@ def _doubts(plant: Plant, share: Float[Tensor, " n_s"], flown: Flown) -> Iterato
                 "zero, or other starts than those that plans are made for"
             )
     seen, starts = 1 + round(float(flown.t.max()) / plant.dt), int((flown.t == 0.0).sum())
-    courses = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0))[:, :seen]
-    for signal, course, read in zip(plant.inputs, courses.unbind(-1), flown.exogenous.unbind(-1), strict=True):
+    for signal, course, read in zip(plant.inputs, inputs[:, :seen].unbind(-1), flown.exogenous.unbind(-1), strict=True):
         changes, differs = (course != course[:, :1]).any(-1).all(), len(course.unique(dim=0)) == DRAWS
         if (read == read.flatten()[0]).all() and (changes or (differs and starts > 1)):
             yield (
@@ -311,9 +312,8 @@ def _same_readings(plant: Plant, flown: Flown, explained: bool) -> Iterator[str]
             yield f"{signals[k]} and {signals[m]} have the same readings"
 
 
-def _strange_inputs(plant: Plant, flown: Flown) -> Iterator[str]:
+def _strange_inputs(plant: Plant, drawn: Inputs, flown: Flown) -> Iterator[str]:
     """Which inputs are read far outside what the plant draws, or at a small share of it."""
-    drawn = plant.draw_exogenous(DRAWS, torch.Generator().manual_seed(0)).flatten(0, -2)
     for signal, course, read in zip(plant.inputs, drawn.unbind(-1), flown.exogenous.unbind(-1), strict=True):
         if _outside(course, read, widths=BEYOND - 1.0) or BEYOND * read.abs().max() < course.abs().min():
             yield f"input {signal.name} is read {_beside(signal, read, course)}"
