@@ -261,8 +261,10 @@ class Supervisor:
         share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
-        few = affordable(self.controller, self.count)
-        others = None if episodes is None else Scenario(*(values[:few] for values in episodes))
+        others = None
+        if episodes is not None:
+            few = affordable(self.controller, self.count)
+            others = Scenario(*(values[:few] for values in episodes))
         known = self.belief.beside_first(policy, self.controller, others)
         if known is None or known[0] <= TWICE * known[1]:
             return "", share
