@@ -297,9 +297,9 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         how = "dearer" if rival == best and clearly_dearer(summary, rival) else "not clearly better"
         larger = "" if config is not None and config.policy == "mlp" else "take --policy mlp, "
         steps.append(
-            f"the live policy is {how} than {rival}: keep it, let the policy observe what it computes, "
-            f"{larger}train with more --twinning.planner.iterations, or judge both in more episodes "
-            f"(--unseen, --real-unseen); rt_torchrl.diagnose({call}) says why"
+            f"the live policy is {how} than {rival}: keep it, let the policy observe what it computes, or give it "
+            f"its form (make_policy), {larger}train with more --twinning.planner.iterations, or judge both in more "
+            f"episodes (--unseen, --real-unseen); rt_torchrl.diagnose({call}) says why"
         )
     elif summary["better"] != live:
         steps.append(f"the idle policy is the better one ({summary['better'].replace('_', '-')}): export that role")

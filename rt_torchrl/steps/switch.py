@@ -393,5 +393,8 @@ class Switch(Step):
             cloned = self.imitation.clone(*policies, seen=self.learner.observations, record=record, judged_on=judged_on)
             if "reason" not in cloned:
                 (self.learner if idle == "model_free" else self.planner).restart()
+                if belief.corrects:
+                    clone = belief.judge(belief.policies[idle], judged_on)
+                    cloned.update(metrics(**{f"expected/{idle}": clone.expected}))
             report = merged(report, cloned)
         return merged(episode, report)
