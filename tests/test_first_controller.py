@@ -105,29 +105,42 @@ def test_the_controller_flies_while_policies_are_expected_to_cost_twice_as_much(
 
 def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
     found, record = started()
+    belief, policy, teacher = found.belief, found.model_based, found.first.teacher
     paid = control_cost(found.twin.plant, record).item()
 
-    def on_twin(policy):
-        flown = found.twin.control(policy, record.states[:1], record.exogenous[None])
-        return control_cost(found.twin.plant, flown).item()
+    def on_twin(policy, *others):
+        flights = [(record.states[:1], record.exogenous[None]), *others]
+        costs = [
+            control_cost(found.twin.plant, found.twin.control(policy, *flight)).mean().item() for flight in flights
+        ]
+        return sum(costs) / len(costs)
 
     # Before a policy has flown, the twin errs for it as for the controller; then the belief corrects it.
-    ratio = on_twin(found.model_based) / on_twin(found.first.teacher)
-    expected = pytest.approx((paid * ratio, paid))
-    assert found.belief.beside_first(found.model_based, found.first.teacher) == expected
+    ratio = on_twin(policy) / on_twin(teacher)
+    assert belief.beside_first(policy, teacher)[:2] == pytest.approx((paid * ratio, paid))
     supervisor, before = found.steps["interact"].supervisor, found.generator.get_state()
     others = supervisor.episodes()  # one flight holds no rare end
     assert torch.equal(found.generator.get_state(), before)
-    costs = [
-        on_twin(policy) + control_cost(found.twin.plant, found.twin.control(policy, *others)).mean().item()
-        for policy in (found.model_based, found.first.teacher)
-    ]
-    expected = pytest.approx((paid * costs[0] / costs[1], paid))
-    assert found.belief.beside_first(found.model_based, found.first.teacher, others) == expected
-    found.belief.append(record, "model_based", paid)
-    assert supervisor.episodes() is None
-    corrected = pytest.approx((found.belief.expected(found.model_based, on_twin(found.model_based)), paid))
-    assert found.belief.beside_first(found.model_based, found.first.teacher, others) == corrected
+    ratio = on_twin(policy, others) / on_twin(teacher, others)
+    assert belief.beside_first(policy, teacher, others)[:2] == pytest.approx((paid * ratio, paid))
+    belief.append(record, "model_based", paid)
+    expected = belief.expected(policy, on_twin(policy))
+    assert belief.beside_first(policy, teacher)[:2] == pytest.approx((expected, paid))
+    expected = belief.expected(policy, on_twin(policy, others)) * on_twin(teacher) / on_twin(teacher, others)
+    assert belief.beside_first(policy, teacher, others)[:2] == pytest.approx((expected, paid))
+
+
+@pytest.mark.parametrize(("error", "dearest"), [(1.0, 1.05), (1.2, 2.0)])
+def test_a_policy_may_be_dearer_only_while_the_twin_is_wrong(monkeypatch, error, dearest):
+    found, record = started(assimilation=AssimilationConfig(iterations=0))
+    belief, supervisor = found.belief, found.steps["interact"].supervisor
+    costs = {found.first.teacher: 1.0}
+    monkeypatch.setattr(found.virtual, "cost", lambda module, episodes, deviation=None: costs[module])
+    belief.first = [belief.first[0]._replace(cost=error)]
+    for share, allowed in ((dearest - 0.01, True), (dearest + 0.01, False)):
+        costs[found.model_based] = share
+        reason, _ = supervisor.refusal("model_based", None)
+        assert (not reason) == allowed
 
 
 def test_a_controller_whose_costs_have_no_ratio_is_named():

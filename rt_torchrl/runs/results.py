@@ -141,7 +141,7 @@ def summarise(
             "baselines": baselines,
         },
         "live": live,
-        "first": None if first is None else dict(zip(("expected", "paid"), first, strict=True)),
+        "first": None if first is None else {"expected": first.expected, "paid": first.paid},
         "better": better_of(algorithm, unseen),
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},

@@ -112,6 +112,20 @@ class Judged(NamedTuple):
     on_twin: float
 
 
+class BesideFirst(NamedTuple):
+    """What a policy costs beside the controller that flew first.
+
+    Attributes:
+        expected: the cost that is expected of the policy where the controller has cost ``paid``.
+        paid: mean cost of the controller's real episodes.
+        right: whether the twin says what all flights have cost; False where this was not asked.
+    """
+
+    expected: float
+    paid: float
+    right: bool = False
+
+
 class Anchors(NamedTuple):
     """What the latest real episodes say of other policies.
 
@@ -209,16 +223,16 @@ class Belief:
     @torch.no_grad()
     def beside_first(
         self, policy: nn.Module, controller: nn.Module | None, others: Scenario | None = None
-    ) -> tuple[float, float] | None:
-        """The cost that is expected of a policy in the episodes of the controller that flew first, and what these cost.
+    ) -> BesideFirst | None:
+        """Compare a policy with the controller that flew first, in the episodes of this one.
 
         Before a policy has flown nothing corrects what the twin says of one. It then errs as it errs for the
-        controller, which it flies in the same episodes, and in others, because one flight holds no rare end.
+        controller, which it flies in the same episodes.
 
         Args:
             policy: the policy.
             controller: the controller; None where no controller flew first.
-            others: the other episodes, if there are any.
+            others: other episodes in which the twin compares both, too, because one flight holds no rare end.
 
         Returns:
             None where no controller flew first or it cost nothing, the twin alone has the word, or the policy is state
@@ -227,18 +241,22 @@ class Belief:
         paid = sum(flight.cost for flight in self.first) / max(1, len(self.first))
         if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
-        episodes = [self.virtual.repeated(flight.trajectory) for flight in self.first]
-        if others is not None and not self.flown:
-            episodes.append(others)
+        theirs = [self.virtual.repeated(flight.trajectory) for flight in self.first]
+        episodes = theirs if others is None else [*theirs, others]
 
-        def on_twin(module: nn.Module) -> float:
+        def on_twin(module: nn.Module, episodes: Sequence[Scenario]) -> float:
             return sum(self.virtual.cost(module, episode) for episode in episodes) / len(episodes)
 
-        cost = on_twin(policy)
-        if self.flown:
-            return self.expected(policy, cost), paid
-        controller_cost = on_twin(controller)
-        return (paid * cost / controller_cost if 0.0 < controller_cost < math.inf else math.inf), paid
+        cost = on_twin(policy, episodes)
+        if self.flown and others is None:
+            return BesideFirst(self.expected(policy, cost), paid)
+        predicted, rival = on_twin(controller, theirs), on_twin(controller, episodes)
+        if not (0.0 < predicted < math.inf and rival < math.inf):
+            return BesideFirst(math.inf, paid)
+        error = paid / predicted
+        expected = self.expected(policy, cost) if self.flown else error * cost
+        right = not self.contradicted and abs(math.log(error)) <= NOISE
+        return BesideFirst(expected * predicted / rival, paid, right)
 
     def policy_of(self, flown: Flown) -> nn.Module:
         """The policy that flew an episode, with the weights that it had in it, until the next call for this role.

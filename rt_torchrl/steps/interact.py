@@ -46,10 +46,11 @@ class ShortTermMemory(deque[Trajectory]):
 
 LEAST_SOUND = 0.5
 """Least share of a real episode in one sound part, below which it is flown again."""
+EQUAL = 1.05
+"""Cost that is expected of a policy over that of the controller that flew first, up to which it may act."""
 TWICE = 2.0
-"""Cost that is expected of a policy over that of the controller that flew first, beyond which the policy is not tried.
-
-A policy that costs less shows how the real system answers other actions, without which plans do not improve."""
+"""The same where the twin is wrong: the flight shows how the real system answers other actions, without which plans do
+not improve."""
 
 
 class Flight(NamedTuple):
@@ -169,7 +170,9 @@ def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
 
 
 class Supervisor:
-    """Lets a policy act only if it is expected to keep the limits, and not to cost twice what flew first.
+    """Lets a policy act only if it is expected to keep the limits, and to cost no more than what flew first.
+
+    It may cost up to twice as much where the twin is wrong about what has flown.
 
     The live policy is asked first, then the idle one. Where neither may act, the weights do that were cleared for the
     limits last, or without these the controller with which the training has begun. Before the first real episode
@@ -217,7 +220,8 @@ class Supervisor:
         Raises:
             ValueError: if nothing may act.
         """
-        episodes, refused, report = self.episodes(), list[str](), dict[str, float | str]()
+        refused, report = list[str](), dict[str, float | str]()
+        episodes = None if self.limits is None else self.episodes()
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
@@ -237,12 +241,12 @@ class Supervisor:
         raise ValueError(f"no policy may act. {report['reason']}. Widen the limits, or use --start controller.")
 
     def episodes(self) -> Scenario | None:
-        """Virtual episodes in which limits are checked, and policies that have not flown beside the controller.
+        """Virtual episodes, in which limits are checked, and policies beside the controller; always the same ones.
 
-        None without either, and before anything is known.
+        None before anything is known.
         """
-        virtual, untried = self.belief.virtual, self.controller is not None and not self.belief.flown
-        if not virtual.processes or not (untried or self.limits is not None):
+        virtual = self.belief.virtual
+        if not virtual.processes:
             return None
         state = virtual.generator.get_state()
         drawn = virtual.draw(self.count)
@@ -255,20 +259,21 @@ class Supervisor:
 
         Args:
             role: role of the policy.
-            episodes: see :meth:`episodes`.
+            episodes: see :meth:`episodes`; None without limits.
         """
         policy = self.policies[role]
         share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
-        others = None
-        if episodes is not None:
+        known = self.belief.beside_first(policy, self.controller)
+        if known is not None and not (self.belief.flown and known.expected <= EQUAL * known.paid):
+            episodes = self.episodes() if episodes is None else episodes
             few = affordable(self.controller, self.count)
-            others = Scenario(*(values[:few] for values in episodes))
-        known = self.belief.beside_first(policy, self.controller, others)
-        if known is None or known[0] <= TWICE * known[1]:
+            others = None if episodes is None else Scenario(*(values[:few] for values in episodes))
+            known = self.belief.beside_first(policy, self.controller, others)
+        if known is None or known.expected <= (EQUAL if known.right else TWICE) * known.paid:
             return "", share
-        expected, paid = map(in_words, known)
+        expected, paid = map(in_words, known[:2])
         where = f"where the controller that flew first cost {paid}"
         return f"{role} may not act: it is expected to cost {expected} {where}", share
 
