@@ -132,6 +132,13 @@ class ReinforcementTwinning(TensorDictSequential):
         for role, half in halves.items():
             if half.policy is not policies[role]:
                 raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
+        modules = [twin.closure, *(policy for policy in policies.values() if not isinstance(policy, StateFeedback))]
+        trained = [{id(w) for w in module.parameters() if w.requires_grad} for module in modules]
+        if len(set.union(*trained)) < sum(map(len, trained)):
+            raise ValueError(
+                "model_free, model_based and the twin's closure share trainable weights, which one step would move "
+                "under another; give each module its own, such as a copy.deepcopy."
+            )
         fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         judged = config.planner.receding_horizon.virtual_episodes if fed_back else config.virtual_episodes
         extremes = EXTREMES if config.planner.method == "multi_start" else 0
@@ -152,7 +159,10 @@ class ReinforcementTwinning(TensorDictSequential):
         interact = (Operate if operating else Interact)(flights, supervisor, belief, config)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
-            assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
+            continues = isinstance(env, Operation) and env.operator.config.continuous
+            assimilation = EnsembleAssimilation(
+                twin, config.assimilation, config.hypotheses, always=fed_back, continues=continues
+            )
         counts = (config.planner.realisations or config.realisations, judged)
         steps: dict[str, Any] = {
             "interact": interact,
@@ -230,7 +240,10 @@ class ReinforcementTwinning(TensorDictSequential):
     def start(
         self, episode: TensorDictBase | None = None, *, tell: Callable[[str], None] = lambda part: None
     ) -> TensorDictBase:
-        """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
+        """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights).
+
+        A step of one's own, or one that is left out, takes no part.
+        """
         assert self.first is not None
         episode = TensorDict() if episode is None else episode
         pupils = self.first.take(self.policies, self.twin.closure)
@@ -241,27 +254,31 @@ class ReinforcementTwinning(TensorDictSequential):
             return episode
         flights = self.first.flights(self.steps["interact"].fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
+        taken = [name for name, step in self.module.items() if step is self.steps[name]]
         counted = len(records[-1].actions) + flights[-1].after[0]
         for flight in flights:
-            self.steps["learn"].store(flight.parts)
+            if "learn" in taken:
+                self.steps["learn"].store(flight.parts)
             self.short_term.append(flight.record)
             if self.first.teacher is not None:
                 self.belief.append(flight.record, FIRST, flight.cost.item())
             if on_twin:
                 self.virtual.learn(flight.record)
-        if on_twin:
+        if "assimilate" in taken:
             tell("fit")
             self.steps["assimilate"].fit(records)
             self.assimilation.explain(self.belief.replayed(records, counted))
         tell("imitation")
         imitating = {role: self.policies[role] for role in pupils}
         imitation, flown = self.steps["switch"].imitation, batch_of(records)
-        report = imitation.begin(self.first.teacher, imitating, flown)
+        cost = torch.stack([flight.cost for flight in flights]).mean().item()
+        report = imitation.begin(self.first.teacher, imitating, flown, cost)
         if counted != self.twin.plant.n_steps:  # later records are those of whole episodes
             self.short_term.clear()
             self.virtual.processes.clear()
-        start_cost = torch.stack([flight.cost for flight in flights]).mean()
-        return merged(merged(episode, report), metrics(start_cost=start_cost))
+        if self.first.teacher is not None:  # nobody pays for a log again
+            report = merged(report, metrics(start_cost=cost))
+        return merged(episode, report)
 
     def conclude(self) -> bool:
         """After the last episode: a plan that no flight has tried does not stay if real episodes contradict the twin.

@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic, optimal_gain
 from printed_commands import documented
 from seeds_and_numbers import seeded
 from small_runs import IDLE
 from tensordict import TensorDict
+from test_classical import PD
 
 import rt_torchrl as rt
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -151,6 +152,28 @@ def test_a_step_of_ones_own_flows_with_the_others():
     assert report["residual"] < 1e-9 and list(report["seconds"].keys()) == [*STEPS[:4], "residual", *STEPS[4:]]
     with pytest.raises(ValueError, match="before='planning' is no step of this arm; choose one of interact, learn"):
         found.insert("other", found.module["plan"], before="planning")
+
+
+@pytest.mark.parametrize("step", ["learn", "assimilate"])
+def test_what_a_step_has_that_is_left_out_is_left_alone(step):
+    """Not even the start takes it; and the belief of a checkpoint does not depend on it."""
+    first = rt.FirstController(PD(LinearQuadratic(horizon=2.0), (0.4, 0.3)))
+    found, other = twinning(first=first), twinning(first=first)
+    before = found.twin.closure.matrix.detach().clone()
+    for each in (found, other):
+        del each.module[step]
+    found.episode()
+    assert torch.equal(found.twin.closure.matrix, before) == (step == "assimilate")
+    assert len(found.learner.memory) == (0 if step == "learn" else 40)
+    other.load_state_dict(found.state_dict())
+    assert len(other.belief.flown) == len(found.belief.flown) == 1 == len(other.belief.first)
+
+
+def test_weights_of_two_modules_are_not_shared():
+    """One step would move them under another."""
+    shared, plant = LinearGain([[0.1, 0.2]]), LinearQuadratic(horizon=2.0)
+    with pytest.raises(ValueError, match="share trainable weights, which one step would move under another"):
+        twinning(plant, model_free=shared, model_based=shared)
 
 
 def test_keys_flow_as_the_steps_declare():

@@ -1,5 +1,6 @@
 """Several twins side by side: what each finds, how they are weighed, and what is planned on them."""
 
+import copy
 import dataclasses
 import math
 
@@ -192,6 +193,22 @@ def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
     assert fit.cost([record.part(0, 7, PLANT.dt)]) < 1e-20  # of an episode that ended before a segment does
 
 
+@pytest.mark.parametrize("continues", [False, True])
+def test_hidden_states_need_not_be_at_rest_where_a_record_does_not_begin_an_episode(continues):
+    """A part of an episode, or a window of a continuous operation, whose clock begins anew: half of it counts."""
+    real = rt.LaggedActuator(PLANT, "force", LAG)
+    record = recorded(real)[0].part(20, 100, PLANT.dt)
+    record = record._replace(start=0.0) if continues else record
+    lagged, wrong = real.closure, copy.deepcopy(real.closure)
+    twin = rt.DigitalTwin(real, wrong)
+    fit = Fit(twin, ASSIMILATION, 5, continues=continues)
+    with torch.no_grad():
+        wrong.base.matrix.mul_(0.5)
+    fit.update([record])
+    torch.testing.assert_close(wrong.base.matrix, lagged.base.matrix, rtol=0.01, atol=2e-3)
+    assert fit.cost([record]) < 1e-6
+
+
 def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
     twin, _ = ensemble(PLANT)
     twin.weights = {ALONE: 0.25, "late": 0.75}
@@ -246,7 +263,7 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
     for fit in assimilation.fits.values():
         monkeypatch.setattr(fit, "update", lambda *_: 1.0)
     replayed = "rt_torchrl.steps.hypotheses.assimilation.misfit"
-    monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is twin.twins[ALONE] else 1.0)
+    monkeypatch.setattr(replayed, lambda one, *_, **__: 100.0 if one is twin.twins[ALONE] else 1.0)
     for done in range(14):
         if done == 13:
             twin.retreat()

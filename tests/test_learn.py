@@ -224,6 +224,27 @@ def test_a_loss_of_ones_own():
     assert reports[0] == pytest.approx(2.0 * reports[1], rel=1e-12)
 
 
+def test_a_critic_of_any_name_is_trained():
+    class Second(DDPGLoss):
+        def __init__(self, actor, critics):
+            super().__init__(actor, critics[0], loss_function="l2")
+            self.convert_to_functional(critics[1], "second_critic", create_target_params=False)
+
+        def forward(self, tensordict):
+            found = super().forward(tensordict)
+            with self.second_critic_params.to_module(self.second_critic):
+                value = self.second_critic(tensordict.select("observation", "action").clone())["state_action_value"]
+            return found.set("loss_second", (value - tensordict["next", "reward"]).square().mean())
+
+    found = learner(method=LearningMethod(Second, critics=2, delay=0), critic_iterations=2, actor_iterations=1)
+    filled(explored(20), found)
+    before = found.loss.second_critic_params.detach().clone()
+    found.update()
+    differ = (found.loss.second_critic_params != before).flatten_keys()
+    assert all(moved.any() for moved in differ.values())
+    assert sum(w.numel() for w in found.actor_adam.weights) == sum(w.numel() for w in found.policy.parameters())
+
+
 @pytest.mark.parametrize("algorithm", METHODS)
 def test_priorities_are_sizes_of_errors_whatever_the_loss_reports(algorithm):
     """Where rewards dominate the values, |δ| grows as they do, and δ² would as their squares."""

@@ -17,9 +17,10 @@ from test_classical import PD
 from test_early_ends import STRONG, WEAK, Falling
 from test_real_system import Rig, connected
 
-from rt_torchrl import PlantEnv, SafetyConfig, SafetyLayer, load_run
+from rt_torchrl import LaggedActuator, PlantEnv, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
 from rt_torchrl.runs.results import entries
+from rt_torchrl.steps.interact import RealFlights
 
 pytestmark = pytest.mark.training
 
@@ -148,10 +149,34 @@ def test_flights_of_the_same_episodes_are_compared_where_one_ends_early():
     assert plant.ended(flights["weak"].states).any(1).all() and not plant.ended(flights["live"].states).any()
     judged = {name: episodes.judge(flown) for name, flown in flights.items()}
     costs, others = (judged[name].control_costs for name in ("live", "weak"))
-    found = entries(plant, flights, judged, "live")["controllers"]["weak"]
+    found = entries(episodes, flights, judged, "live")["controllers"]["weak"]
     assert found["ratio"]["mean"] == pytest.approx((costs.mean() / others.mean()).item()) and found["cheaper"] == 3
-    flights["weak"] = flights["weak"]._replace(exogenous=flights["weak"].exogenous + 1e-9)  # of other episodes
-    assert "ratio" not in entries(plant, flights, judged, "live")["controllers"]["weak"]
+    flights["weak"].exogenous.add_(1e-9)  # of other episodes
+    assert "ratio" not in entries(episodes, flights, judged, "live")["controllers"]["weak"]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_flights_cost_what_the_system_measured_however_noisy_its_readings_are(monkeypatch, hidden):
+    """An end early, and states that no sensor reads, show in no reading."""
+    plant, costs, lengths = Falling(), [], []
+    fly = RealFlights.fly
+
+    def noted(self, *arguments, **options):
+        flight = fly(self, *arguments, **options)
+        costs.append(flight.cost.item())
+        lengths.append(len(flight.record.actions))
+        return flight
+
+    monkeypatch.setattr(RealFlights, "fly", noted)
+    system = PlantEnv(LaggedActuator(plant, "force", 0.3) if hidden else plant, seed=0, noise=0.05)
+    episodes = RealEpisodes(system, 10, physics=plant)
+    flown = episodes.fly(LinearGain(WEAK))
+    over = plant.ended(flown.states[:, 1:]).any(1)
+    assert min(lengths) < plant.n_steps and (hidden or not all(over[[n < plant.n_steps for n in lengths]]))
+    assert episodes.paid == costs and episodes.judge(flown).control_costs.tolist() == costs
+    exact = episodes.identification_costs(plant, plant.closure, flown)
+    ends = [len(flight.actions) for flight in episodes.to_their_end(flown)]
+    assert ends == lengths and (hidden or exact.isfinite().all())
 
 
 class Tracking(PD):

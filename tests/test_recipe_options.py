@@ -59,6 +59,9 @@ def test_presets_of_a_neural_closure_and_of_predictive_control(plant):
     assert dataclasses.replace(neural, preset="default") == of_command_line(plant, "--closure", "mlp")
     assert mpc.twinning.planner == dataclasses.replace(usual.twinning.planner, method="receding_horizon")
     assert dataclasses.replace(mpc, preset="default", twinning=usual.twinning) == usual
+    both = of_command_line(plant, "--preset", "mpc", "--closure", "mlp")
+    assert both.twinning.assimilation == neural.twinning.assimilation
+    assert both.twinning.planner.method == "receding_horizon"
 
 
 @pytest.mark.parametrize("plant", [*PLANTS, "pendulum", "served_turbine"])

@@ -177,8 +177,9 @@ def test_errors_of_the_twin_are_told_in_units_over_what_was_fitted():
 
 
 def test_every_window_is_paid_and_episodes_are_counted_from_one():
-    episodes = [{"episode": 1, "start_cost": 5.0, "real_cost": 2.0, "windows": 3.0}, {"episode": 2, "real_cost": 1.0}]
-    assert results.cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.0, "episodes": 6, "judging": [1.5]}
+    windows = {"real_cost": 2.0, "windows": 3.0, "largest_cost": 5.5}
+    episodes = [{"episode": 1, "start_cost": 5.0, **windows}, {"episode": 2, "real_cost": 1.0}]
+    assert results.cost_of_learning(episodes, [1.5]) == {"sum": 13.5, "largest": 5.5, "episodes": 6, "judging": [1.5]}
     lines = table.alarm_lines([episode | {"alarm": 1.0, "warning": "the twin is wrong"} for episode in episodes])
     assert lines[0].endswith("in 2 of 2 episodes") and lines[1:] == ["  episode 2: the twin is wrong"]
 

@@ -15,7 +15,7 @@ from test_hypotheses import ASSIMILATION as NEWTON
 from test_hypotheses import LAG, Suspecting
 
 import rt_torchrl as rt
-from rt_torchrl.steps.start import transitions_of
+from rt_torchrl.steps.start import RecordedFlights, transitions_of
 from rt_torchrl.steps.switch import clones
 
 pytestmark = pytest.mark.training
@@ -150,7 +150,7 @@ def test_a_log_teaches_twin_and_policies(tmp_path, horizon, gap):
     for policy in found.policies.values():
         torch.testing.assert_close(policy.gain.detach(), torch.tensor([GAINS]).double(), rtol=0.02, atol=0.02)
     assert torch.dist(found.twin.closure.matrix, found.twin.plant.closure.matrix) < 0.5 * before
-    assert report["start_cost"] > 0.0 and found.referee.live == "model_based"
+    assert "start_cost" not in report and found.referee.live == "model_based"  # nobody has paid for it
     assert (len(found.virtual.processes), not found.short_term) == ((4, False) if whole else (0, True))
     assert len(found.learner.observations()) == {8.0: 80, 1.5: 15, 3.0: 24}[horizon]
 
@@ -162,7 +162,7 @@ def test_a_run_from_a_log_is_resumed_without_the_log(tmp_path):
     first = training(tmp_path / "run", episodes=1, **options).train()["episodes"]
     path.unlink()
     both = training(tmp_path / "run", episodes=2, resume=True, **options).train()["episodes"]
-    assert "start_cost" in first[0] and "start_cost" not in both[1] and len(both) == 2
+    assert "start_error_model_free" in first[0] and "start_error_model_free" not in both[1] and len(both) == 2
     assert rt.load_run(tmp_path / "run").config.start == str(path)
 
 
@@ -200,5 +200,8 @@ def test_transitions_of_a_record_are_those_of_a_flight(plant):
     ends = [("next", key) for key in ("observation", "reward", "done", "terminated", "truncated")]
     for key in ("observation", *ends):
         torch.testing.assert_close(found[key], episode[key], rtol=1e-13, atol=1e-13)
+    (flight,) = RecordedFlights(plant, [record]).flights(None)
+    rest = (plant.n_steps - len(episode)) * (plant.end_cost or 0.0)
+    assert flight.cost.item() == pytest.approx((rest - episode["next", "reward"].sum().item()) / plant.n_steps)
     part, rewards = transitions_of(plant, record.part(0, 10, plant.dt)), episode["next", "reward"][:10]
     torch.testing.assert_close(part["next", "reward"], rewards, rtol=1e-13, atol=1e-13)

@@ -109,7 +109,7 @@ def test_ratios_are_those_of_common_seeds_with_positive_costs():
 
 def test_what_diverges_costs_infinitely(tmp_path):
     run = FinishedRun.read(leave(tmp_path / "run", seed=0, costs=[1.0, NAN], curve=(NAN, 1.0)))
-    assert run.cost == math.inf and run.curve == [math.inf, 1.0] and sum(run.real) == math.inf
+    assert run.cost == math.inf and run.unseen == [math.inf, 1.0] and sum(run.real) == math.inf
     for merits in itertools.permutations((1.0, math.nan, 3.0)):  # in whatever order the folders are given
         row = Row(name="a", runs=[dataclasses.replace(run, merit={"power [W]": merit}) for merit in merits])
         assert math.isnan(row.numbers(row)["merit"]["power [W]"])
@@ -152,6 +152,20 @@ def test_costs_on_different_twins_are_not_compared(tmp_path):
     assert found.rows[0].costs == {0: 5.0, 1: 5.0} and found.numbers()["controllers"] == {"PI": 8.0}
     with pytest.raises(ValueError, match="differ in their place of the unseen episodes"):
         compare_runs([*folders, leave(tmp_path / "2", seed=2, costs=[1.0, 2.0])])
+
+
+def test_a_panel_shows_one_kind_of_cost(tmp_path):
+    """Those on unseen episodes, if all runs have them."""
+    folders = [leave(tmp_path / f"{seed}", seed=seed, costs=[1.0, 2.0]) for seed in (0, 1)]
+    metrics = json.loads((folders[1] / "metrics.json").read_text())
+    shown = {}
+    for judged in (True, False):
+        (axes,) = comparison_figure([compare_runs(folders)], "title").axes
+        shown[judged] = axes.lines[0].get_ydata().tolist()
+        for episode in metrics["episodes"]:
+            episode.pop("J_a_unseen", None)
+        (folders[1] / "metrics.json").write_text(json.dumps(metrics))
+    assert shown == {True: [4.0, 2.0], False: [8.0, 4.0]}
 
 
 # The study itself.
@@ -260,4 +274,4 @@ def test_an_interrupted_training_ends_the_study_and_goes_on(tmp_path, monkeypatc
     first, second = (tmp_path / "tiny" / "twinning" / f"seed-{seed}" for seed in (0, 1))
     assert len(json.loads((first / "metrics.json").read_text())["episodes"]) == 1 and not second.exists()
     (comparison,), failures = study.studied(made)
-    assert not failures and [len(run.curve) for run in comparison.rows[0].runs] == [2, 2]
+    assert not failures and [len(run.unseen) for run in comparison.rows[0].runs] == [2, 2]

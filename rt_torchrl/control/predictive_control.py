@@ -235,7 +235,7 @@ class PredictiveControl(nn.Module):
 
     @property
     def solves(self) -> list[Solve]:
-        """The solves of the episode in which it acted last, without the one before its beginning."""
+        """The solves since the beginning of the episode or the last report, without the one before its beginning."""
         return self._acting.solves
 
     def begin(self) -> None:
@@ -258,11 +258,13 @@ class PredictiveControl(nn.Module):
 
     def report(self) -> dict[str, float]:
         """Wall-clock times of the solves [ms], and the number of those that diverged."""
-        seconds = [solve.seconds for solve in self.solves]
+        solves = self.solves.copy()
+        self.solves.clear()  # an operation that is not reset begins no episode
+        seconds = [solve.seconds for solve in solves]
         return {
             "solve_median": 1e3 * statistics.median(seconds),
             "solve_max": 1e3 * max(seconds),
-            "diverged_solves": float(sum(solve.diverged for solve in self.solves)),
+            "diverged_solves": float(sum(solve.diverged for solve in solves)),
         }
 
     def forward(self, observation: Tensor) -> Tensor:

@@ -177,9 +177,14 @@ class UnseenEpisodes:
             flown = flown.segments(min(segment, n), physics.dt) if segment else flown
             return costs(flown).unflatten(0, (episodes, -1)).mean(1)
 
-        if not self.plant.ended(flown.states).any():
+        flights = self.to_their_end(flown)
+        if all(len(flight.actions) == self.plant.n_steps for flight in flights):
             return means(flown)
-        return torch.cat([means(batch_of([until_end(self.plant, flight)])) for flight in flown.each()])
+        return torch.cat([means(batch_of([flight])) for flight in flights])
+
+    def to_their_end(self, flown: Trajectory) -> list[Trajectory]:
+        """The flown episodes one by one, each to its early end where it has one."""
+        return [until_end(self.flying, flight) for flight in flown.each()]
 
 
 class TwinEpisodes(UnseenEpisodes):
@@ -251,17 +256,33 @@ class RealEpisodes(UnseenEpisodes):
     Args:
         system: the real system.
         count: number of episodes, at least 2.
+        physics: the plant that is known of it, with the states that sensors read; None for the system's own plant.
         device: device of the twin, which replays the episodes.
     """
 
     judged_on = "real system"
 
-    def __init__(self, system: "RealSystem", count: int = 20, *, device: torch.device | str = "cpu"):
+    def __init__(
+        self,
+        system: "RealSystem",
+        count: int = 20,
+        *,
+        physics: Plant | None = None,
+        device: torch.device | str = "cpu",
+    ):
         super().__init__(system.plant, count, device=device)
         self.closure = None
+        self.physics = system.plant if physics is None else physics
         self._system, self._count = system, count
+        self._flights: list[tuple[Trajectory, Costs, list[int]]] = []
+        """Flown episodes with the J_a and the number of control intervals of each."""
         self.paid: list[float] = []
         """J_a of each flight, also of those before a failure or an interrupt."""
+
+    @property
+    def flying(self) -> Plant:
+        """The plant that is known of the system, of whose states the flights hold the readings."""
+        return self.physics
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
@@ -277,7 +298,9 @@ class RealEpisodes(UnseenEpisodes):
 
         if isinstance(policy, RealController):
             whole = policy.fly_real(self._count, seed=UNSEEN_SEED)
-            self.paid += control_cost(self.plant, whole).tolist()
+            lengths = [len(flight.actions) for flight in super().to_their_end(whole)]
+            self._flights.append((whole, control_cost(self.physics, whole), lengths))
+            self.paid += self._flights[-1][1].tolist()
             return whole
         generator = torch.Generator(device=self.initial_state.device)
         actor = LivePolicy(self.plant, policy, ExplorationConfig(), generator=generator)
@@ -288,11 +311,25 @@ class RealEpisodes(UnseenEpisodes):
         flown = list[Trajectory]()
         try:
             for _ in range(self._count):
-                flown.append(self._to_the_horizon(flights.fly(policy, strength=0.0, whole=True).record))
-                self.paid += control_cost(self.plant, batch_of(flown[-1:])).tolist()
+                flight = flights.fly(policy, strength=0.0, whole=True)
+                flown.append(flight.record)
+                self.paid.append(flight.cost.item())
         finally:
             self._system.load_state_dict(state)
-        return batch_of(flown)
+        whole = batch_of([self._to_the_horizon(record) for record in flown])
+        costs = whole.states.new_tensor(self.paid[-self._count :])
+        self._flights.append((whole, costs, [len(record.actions) for record in flown]))
+        return whole
+
+    def judge(self, flown: Trajectory) -> "Judged":
+        """J_a as the system measured it, and the plant's own quantities, in episodes that were flown here."""
+        costs = next(costs for known, costs, _ in self._flights if known is flown)
+        return super().judge(flown)._replace(control_costs=costs)
+
+    def to_their_end(self, flown: Trajectory) -> list[Trajectory]:
+        """The flown episodes one by one, each to the end that the system had, which noisy readings need not show."""
+        lengths = next(lengths for known, _, lengths in self._flights if known is flown)
+        return [flight.part(0, n, self.plant.dt) for flight, n in zip(flown.each(), lengths, strict=True)]
 
     def _to_the_horizon(self, record: Trajectory) -> Trajectory:
         """A record of an episode; one that ended early stays in the state in which it ended."""
@@ -312,7 +349,7 @@ class Judged(NamedTuple):
     def statistics(self) -> dict[str, Any]:
         """Number of ``episodes``; mean and interval of ``J_a`` and of each quantity in ``merit``, with its median."""
         merit = {
-            name: mean_with_confidence(values) | {"median": values.median().item()}
+            name: mean_with_confidence(values) | {"median": values.quantile(0.5).item()}
             for name, values in self.merit.items()
         }
         count = len(self.control_costs)

@@ -207,7 +207,7 @@ def _draw_law(ax: Axes, snapshot: Snapshot, output: int, feature: int) -> None:
     visited = snapshot.features
     low, high = visited[:, feature].min().item(), visited[:, feature].max().item()
     axis = torch.linspace(low, high, RESOLUTION, dtype=visited.dtype, device=visited.device)
-    points = visited.median(0).values.expand(RESOLUTION, -1).clone()
+    points = visited.quantile(0.5, 0).expand(RESOLUTION, -1).clone()
     points[:, feature] = axis
     for name, law in style.closures(snapshot).items():
         if name != "true" or snapshot.true_closure is not None:

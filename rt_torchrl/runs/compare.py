@@ -36,9 +36,8 @@ class FinishedRun:
         place: system that the costs on unseen episodes are those of: the simulated or the real one.
         live: role of the policy that was live at the end.
         costs: J_a of that policy on each unseen episode.
-        curve: mean J_a of the live policy on the unseen episodes after each real episode (``--unseen-every 1``), or
-            J_a of the real episodes.
-        judged: whether ``curve`` holds costs on unseen episodes.
+        unseen: mean J_a of the live policy on the unseen episodes after each real episode (``--unseen-every 1``); None
+            without.
         real: J_a of each real episode.
         merit: mean of each of the plant's own quantities under that policy.
         controllers: mean J_a of each classical controller over the unseen episodes, and means of the plant's own
@@ -52,8 +51,7 @@ class FinishedRun:
     place: str
     live: Role
     costs: list[float]
-    curve: list[float]
-    judged: bool
+    unseen: list[float] | None
     real: list[float]
     merit: dict[str, float]
     controllers: dict[str, tuple[float, dict[str, float]]]
@@ -87,8 +85,7 @@ class FinishedRun:
             place=place,
             live=live,
             costs=_numbers(costs[live]),
-            curve=_numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes),
-            judged=judged,
+            unseen=_numbers(episode["J_a_unseen"] for episode in episodes) if judged else None,
             real=_numbers(real_costs(episodes)),
             merit=_means(controllers[live]["merit"]),
             controllers={
@@ -128,10 +125,11 @@ class Row:
     @property
     def episodes_to_optimum(self) -> list[float] | None:
         """Number of real episodes until the live policy of each run is near the optimum; infinite for never."""
-        if self.optimum is None or not all(run.judged for run in self.runs):
+        courses = [run.unseen for run in self.runs if run.unseen is not None]
+        if self.optimum is None or len(courses) < len(self.runs):
             return None
         near = self.optimum + NEAR * abs(self.optimum)
-        reached = [[k for k, cost in enumerate(run.curve, 1) if cost <= near] for run in self.runs]
+        reached = [[k for k, cost in enumerate(course, 1) if cost <= near] for course in courses]
         return [float(numbers[0]) if numbers else math.inf for numbers in reached]
 
     def numbers(self, first: "Row") -> dict[str, Any]:
@@ -151,7 +149,8 @@ class Row:
             "alarms": spread([float(run.alarms) for run in self.runs]),
             "seconds": spread([run.seconds for run in self.runs]),
             "merit": {name: float(np.median([run.merit[name] for run in self.runs])) for name in self.runs[0].merit},
-            "curves": [run.curve for run in self.runs],
+            "unseen": [run.unseen for run in self.runs],
+            "real": [run.real for run in self.runs],
         }
 
 
@@ -310,6 +309,7 @@ def comparison_figure(comparisons: Sequence[Comparison], title: str) -> "Figure"
     """J_a of the live policies over the real episodes: a panel for each system.
 
     A line is the median of a row's seeds, its band their range. The optimum and classical controllers are horizontal.
+    Costs are those on unseen episodes where all runs of a system have them, or else those of the real episodes.
     """
     from matplotlib.ticker import MaxNLocator  # here, because tables need no figure
 
@@ -330,9 +330,11 @@ def _panel(ax: "Axes", comparison: Comparison, names: Sequence[str]) -> None:
     """The rows of one system."""
     from rt_torchrl.figures.style import REFERENCE_LINE, caption, logarithmic_if_wide
 
+    judged = all(run.unseen is not None for row in comparison.rows for run in row.runs)
     for row in comparison.rows:
-        length, place = min(len(run.curve) for run in row.runs), names.index(row.name)
-        curves, number = np.array([run.curve[:length] for run in row.runs]), np.arange(1, length + 1)
+        courses = [run.real if run.unseen is None or not judged else run.unseen for run in row.runs]
+        length, place = min(map(len, courses)), names.index(row.name)
+        curves, number = np.array([course[:length] for course in courses]), np.arange(1, length + 1)
         look: dict[str, Any] = {"color": COLOURS[place % len(COLOURS)]}
         ax.fill_between(number, curves.min(0), curves.max(0), alpha=0.12, linewidth=0, **look)
         ax.plot(number, np.median(curves, 0), "o-", markersize=4, label=row.name, **look)
@@ -341,7 +343,7 @@ def _panel(ax: "Axes", comparison: Comparison, names: Sequence[str]) -> None:
     controllers = comparison.rows[0].runs[0].controllers
     for (name, (cost, _)), dash in zip(controllers.items(), DASHES * len(controllers), strict=False):
         ax.axhline(cost, label=name, **REFERENCE_LINE | {"linestyle": dash})
-    caption(ax, f"{comparison.title}: $J_a$")
+    caption(ax, f"{comparison.title}: $J_a$" + ("" if judged else " of the real episodes"))
     logarithmic_if_wide(ax)
 
 

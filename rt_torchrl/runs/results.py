@@ -13,12 +13,18 @@ from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation.law import asked_features, name_of, varying
-from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, compared, mean_with_confidence
+from rt_torchrl.evaluation.unseen import (
+    Baseline,
+    Judged,
+    RealEpisodes,
+    UnseenEpisodes,
+    compared,
+    mean_with_confidence,
+)
 from rt_torchrl.fit.least_squares import not_white
 from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
-from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.metrics import read_metrics, real_costs
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import ROLES, Role
@@ -26,7 +32,7 @@ from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.steps.switch import clones, of_each_role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, until_end
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 HIGH_CORRELATION = 0.9
@@ -197,7 +203,7 @@ def law_of(twin: DigitalTwin, records: Sequence[Trajectory], uncertainty: Uncert
     errors = uncertainty.errors_of(lambda: twin.believed_law(visited)[:, places])
     plant, outputs = twin.believed.plant.innermost, dict[str, Any]()
     for k, error in zip(places, errors.T, strict=True):
-        spread = {"median": error.median().item(), "greatest": error.max().item()}
+        spread = {"median": error.quantile(0.5).item(), "greatest": error.max().item()}
         outputs[name_of(plant.closure_outputs, k, "output")] = {"range": _ends(values[:, k])} | spread
     inputs = [name_of(plant.closure_inputs, k, "feature") for k in range(features.shape[-1])]
     return {"features": dict(zip(inputs, map(_ends, features.T), strict=True)), "outputs": outputs}
@@ -273,7 +279,8 @@ def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | N
     """
     costs = [record["start_cost"] for record in episodes if "start_cost" in record]
     costs += [torch.inf if cost is None else cost for cost in (*real_costs(episodes), *judging)]
-    paid = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
+    windows = [record["largest_cost"] for record in episodes if "largest_cost" in record]
+    paid = {"sum": sum(costs), "largest": max(costs + windows), "episodes": len(costs)}
     return paid | ({"judging": list(judging)} if judging else {})
 
 
@@ -303,7 +310,7 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
 
 
 def entries(
-    plant: Plant, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
+    episodes: RealEpisodes, flights: Mapping[str, Trajectory], judged: Mapping[str, Judged], live: Role
 ) -> dict[str, Any]:
     """The entry ``real_unseen`` of the summary, without J_p.
 
@@ -311,15 +318,15 @@ def entries(
     the other one, with a confidence interval, and ``cheaper`` the number of episodes in which it is cheaper.
 
     Args:
-        plant: plant of the real system.
+        episodes: the episodes on the real system.
         flights: flights by the name of the controller.
         judged: what these cost.
         live: name of the live policy, which need not have flown.
     """
-    controllers = {}
+    controllers, ends = {}, {name: episodes.to_their_end(flown) for name, flown in flights.items()}
     for name, judgement in judged.items():
         controllers[name] = judgement.statistics()
-        if name != live and live in flights and _same_episodes(plant, flights[name], flights[live]):
+        if name != live and live in flights and all(map(_same_episode, ends[name], ends[live])):
             controllers[name] |= compared(judged[live].control_costs, judgement.control_costs)
     return {
         "controllers": controllers,
@@ -327,16 +334,10 @@ def entries(
     }
 
 
-def _same_episodes(plant: Plant, flown: Trajectory, other: Trajectory) -> bool:
+def _same_episode(flown: Trajectory, other: Trajectory) -> bool:
     """Whether starts are the same, and inputs until one of both ends early: nothing is read after that."""
-    if not torch.equal(flown.states[:, 0], other.states[:, 0]):
-        return False
-    for flights in zip(flown.each(), other.each(), strict=True):
-        inputs = [until_end(plant, flight).exogenous for flight in flights]
-        n = min(map(len, inputs))
-        if not torch.equal(inputs[0][:n], inputs[1][:n]):
-            return False
-    return True
+    n = min(len(flown.exogenous), len(other.exogenous))
+    return torch.equal(flown.states[0], other.states[0]) and torch.equal(flown.exogenous[:n], other.exogenous[:n])
 
 
 def judged_before(folder: Path, episodes: int) -> dict[str, Any] | None:

@@ -317,14 +317,14 @@ class Run:
         names = ", ".join(f"{count} of {name}" for name in laws)
         bar.write(f"{count * len(laws)} flights on the real system, which count as paid: {names}")
         bar.doing("judging on the real system")
-        episodes = RealEpisodes(self._system, count, device=self.device)
+        episodes = RealEpisodes(self._system, count, physics=self.unseen.physics, device=self.device)
         episodes.bounds = self.unseen.bounds
         flights = self._real_flights(episodes, laws, bar)
         self._paid += episodes.paid
         if not flights:
             return earlier
         judged = {name: episodes.judge(flown) for name, flown in flights.items()}
-        entry = results.entries(episodes.plant, flights, judged, live)
+        entry = results.entries(episodes, flights, judged, live)
         if live in flights:
             J_p, before = results.twin_costs(episodes, self.algorithm, self.initial_closure, flights[live])
             entry |= {"J_p": mean_with_confidence(J_p), "J_p_before": mean_with_confidence(before)}

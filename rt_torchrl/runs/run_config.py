@@ -53,7 +53,8 @@ class RunConfig:
             policy paper, and offer other policies.
         hidden: widths of the hidden layers of an mlp policy.
         closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
-            call its plant's own law paper. An mlp has the defaults of the preset neural.
+            call its plant's own law paper. An mlp has the defaults of the preset neural, but with the
+            preset paper those of the paper.
         episodes: number n_e of real episodes.
         seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
@@ -207,11 +208,11 @@ class RunConfig:
         See :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
         usual = type(self)()
-        preset: Preset = "neural" if self.closure == "mlp" and self.preset == "default" else self.preset
-        defaults = dataclasses.replace(
-            usual, preset=self.preset, **self.presets()["default" if preset == "mpc" else preset]
-        )
-        if preset == "mpc":
+        preset: Preset = "default" if self.preset == "mpc" else self.preset
+        if self.closure == "mlp" and preset == "default":
+            preset = "neural"
+        defaults = dataclasses.replace(usual, preset=self.preset, **self.presets()[preset])
+        if self.preset == "mpc":
             planner = defaults.twinning.planner
             planner = dataclasses.replace(planner, method="receding_horizon")
             defaults = dataclasses.replace(defaults, twinning=dataclasses.replace(defaults.twinning, planner=planner))

@@ -314,7 +314,7 @@ class Assimilate(Step):
         short_term: Sequence[Trajectory],
         realisations: int,
     ):
-        super().__init__(assimilation=assimilation, belief=belief)
+        super().__init__(assimilation=assimilation)
         self.assimilation, self.belief, self.short_term = assimilation, belief, short_term
         self.realisations = realisations
         self.closure_before: dict[str, Any] | None = None

@@ -313,7 +313,7 @@ class Interact(Step):
 
     def __init__(self, flights: RealFlights, supervisor: Supervisor, belief: Belief, config: TwinningConfig):
         short_term = ShortTermMemory(maxlen=config.records)
-        super().__init__(env=flights.env, supervisor=supervisor, short_term=short_term)
+        super().__init__(env=flights.env, supervisor=supervisor, short_term=short_term, belief=belief)
         self.flights, self.supervisor, self.belief, self.short_term = flights, supervisor, belief, short_term
         self.config = config
 
@@ -335,8 +335,10 @@ class Interact(Step):
 
     def _report(self, flights: Sequence[Flight]) -> TensorDict:
         """The mean cost of flights, their faults, and how often and why they were flown again."""
-        cost, last = torch.stack([flight.cost for flight in flights]).mean(), flights[-1]
-        entries: dict[str, Any] = {"real_cost": cost, "reward": -cost}
+        costs, last = torch.stack([flight.cost for flight in flights]), flights[-1]
+        entries: dict[str, Any] = {"real_cost": costs.mean(), "reward": -costs.mean()}
+        if len(flights) > 1:
+            entries["largest_cost"] = costs.max()
         if refused := [reason for flight in flights for reason in flight.refused]:
             entries |= {"episodes_refused": float(len(refused)), "refusal": "; ".join(refused)}
         kinds = Counter(fault.kind for fault in self.flights.faults)
@@ -430,5 +432,5 @@ class Operate(Interact):
         )
         late = 1e3 * torch.cat([flight.transitions["late"].flatten() for flight in flights])
         if late.any():
-            report.update(metrics(late_median=late.median(), late_p99=late.quantile(0.99), late_max=late.max()))
+            report.update(metrics(late_median=late.quantile(0.5), late_p99=late.quantile(0.99), late_max=late.max()))
         return flights, report

@@ -29,7 +29,7 @@ from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
 from rt_torchrl.steps.config import LearnerConfig
-from rt_torchrl.steps.losses import BATCH, METHODS, TRANSITION, LearningMethod, traced
+from rt_torchrl.steps.losses import ACTOR, BATCH, METHODS, TRANSITION, LearningMethod, traced
 from rt_torchrl.steps.memory import CORRECTION, LongTermMemory
 from rt_torchrl.steps.report import Step, merged, metrics, same_architecture, weight_change
 
@@ -198,8 +198,8 @@ class ActorCritic:
         targets = any(name.startswith("target_") for name, _ in self.loss.named_buffers())
         self.target = SoftUpdate(self.loss, tau=config.target_rate) if targets else None
         named = [(name, w) for name, w in self.loss.named_parameters() if w.requires_grad]
-        self.critic_adam = Adam([w for name, w in named if "value_network" in name], self.critic_rate)
-        self.actor_adam = Adam([w for name, w in named if "value_network" not in name], config.actor_rate)
+        self.critic_adam = Adam([w for name, w in named if not name.startswith(ACTOR)], self.critic_rate)
+        self.actor_adam = Adam([w for name, w in named if name.startswith(ACTOR)], config.actor_rate)
         self.shortest = config.return_steps
         """Least number of control intervals in a row that can be stored."""
         self._returns = MultiStep(config.discount, config.return_steps)

@@ -19,6 +19,11 @@ from torchrl.objectives import CrossQLoss, DDPGLoss, LossModule, REDQLoss, SACLo
 if TYPE_CHECKING:
     from rt_torchrl.steps.learn import ActorCritic, Adam
 
+OF_ACTOR = ("loss_actor", "loss_alpha")
+"""Losses that train the policy; all others train critics."""
+ACTOR = ("actor_network", "log_alpha")
+"""Beginnings of the names of the weights that these move; all others are those of critics."""
+
 
 class LearningMethod(NamedTuple):
     """A model-free method: the loss, and what it needs.
@@ -102,14 +107,14 @@ def iteration(learner: "ActorCritic", kind: str, *batch: Tensor) -> dict[str, Te
     results: dict[str, Tensor] = {}
     steps = list[tuple["Adam", list[Tensor]]]()
     if critic:
-        loss = torch.stack([loss for key, loss in losses.items() if "value" in key]).sum()
+        loss = torch.stack([loss for key, loss in losses.items() if key not in OF_ACTOR]).sum()
         gradients = slopes(loss, learner.critic_adam.weights)
         errors = learner.sizes(transitions["td_error"].detach())
         results |= {"critic_loss": loss.detach(), "errors": errors, "td_error": errors.mean()}
         results["critic_gradient"] = get_total_norm(gradients)
         steps.append((learner.critic_adam, gradients))
     if kind != "critic":
-        loss = torch.stack([loss for key, loss in losses.items() if "value" not in key]).sum()
+        loss = torch.stack([loss for key, loss in losses.items() if key in OF_ACTOR]).sum()
         gradients = slopes(loss, learner.actor_adam.weights)
         norm = get_total_norm(gradients)
         share = ((math.inf if method.relaxed else LIMIT) / (norm + TINY)).clamp(max=1.0)

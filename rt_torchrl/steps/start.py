@@ -140,7 +140,9 @@ class RecordedFlights(Start):
 
     def flights(self, fly: Fly) -> list[Flight]:
         flown = [(transitions_of(self.plant, record), record) for record in self.records]
-        return [Flight(transitions, record, [transitions]) for transitions, record in flown]
+        n, end_cost = self.plant.n_steps, self.plant.end_cost or 0.0
+        afters = [(n - len(t) if t["next", "terminated"][-1] else 0, end_cost) for t, _ in flown]
+        return [Flight(t, record, [t], after=after) for (t, record), after in zip(flown, afters, strict=True)]
 
 
 def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:

@@ -31,7 +31,7 @@ from rt_torchrl.steps.plan import Planner
 from rt_torchrl.steps.report import Step, merged, metrics, record_of, same_architecture
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 Event = Literal["keep", "swap", "clone"]
 STALL = 0.5
@@ -194,7 +194,9 @@ class Imitation:
         costs = f"it is expected to cost {clone.expected:.4g}, and what it replaces {replaced.expected:.4g}"
         return metrics(f"clone refused: {costs}", **entries, event="keep")
 
-    def begin(self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory) -> TensorDict:
+    def begin(
+        self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, cost: float
+    ) -> TensorDict:
         """Make the policies imitate a controller; one that would fare worse on the twin than before stays as it was.
 
         Where a twin is trained, they also learn from virtual episodes, and are judged in them.
@@ -203,6 +205,7 @@ class Imitation:
             teacher: the controller, a policy or :class:`StateFeedback`; None if only the records show its actions.
             policies: the policies by role; state feedback among them is left alone.
             records: real episodes that the controller has flown.
+            cost: mean J_a of these.
 
         Returns:
             ``start_error_`` of each role, the RMS difference of the actions as a share of their ranges, and on the twin
@@ -219,16 +222,21 @@ class Imitation:
             elif judged_on is None:
                 report.update(metrics(**{f"start_error_{role}": self._match(policy, [self._of_record(records)])}))
             else:
-                report = merged(report, self._begun(teacher, role, policy, records, judged_on))
+                report = merged(report, self._begun(teacher, role, policy, records, judged_on, cost))
         return report
 
     def _begun(
-        self, teacher: nn.Module | None, role: Role, policy: nn.Module, records: Trajectory, judged_on: Scenario
+        self,
+        teacher: nn.Module | None,
+        role: Role,
+        policy: nn.Module,
+        records: Trajectory,
+        judged_on: Scenario,
+        teacher_cost: float,
     ) -> TensorDict:
         before, start = copy.deepcopy(policy.state_dict()), self.virtual.judge(policy, judged_on)
         if teacher is None:
             error = self._match(policy, [self._of_record(records)])
-            teacher_cost = control_cost(self.virtual.twin.plant, records).mean().item()
         else:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
             error = self.imitate(teacher, policy, seen=records, draw=draw)
