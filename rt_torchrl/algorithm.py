@@ -133,8 +133,8 @@ class ReinforcementTwinning(TensorDictSequential):
             if half.policy is not policies[role]:
                 raise ValueError(f"{type(half).__name__} trains another policy than {role}; build it with that module.")
         modules = [twin.closure, *(policy for policy in policies.values() if not isinstance(policy, StateFeedback))]
-        trained = [{id(w) for w in module.parameters() if w.requires_grad} for module in modules]
-        if len(set.union(*trained)) < sum(map(len, trained)):
+        moved = [{id(w) for w in module.parameters() if w.requires_grad} for module in modules]
+        if len(set.union(*moved)) < sum(map(len, moved)):
             raise ValueError(
                 "model_free, model_based and the twin's closure share trainable weights, which one step would move "
                 "under another; give each module its own, such as a copy.deepcopy."
@@ -159,7 +159,7 @@ class ReinforcementTwinning(TensorDictSequential):
         interact = (Operate if operating else Interact)(flights, supervisor, belief, config)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
-            continues = isinstance(env, Operation) and env.operator.config.continuous
+            continues = isinstance(env, Operation) and env.continuous
             assimilation = EnsembleAssimilation(
                 twin, config.assimilation, config.hypotheses, always=fed_back, continues=continues
             )

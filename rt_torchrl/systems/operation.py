@@ -324,7 +324,7 @@ class Operation:
                 f"what acts cannot be sent to a process of its own ({type(error).__name__}: {error}); give "
                 "policies and systems that pickle."
             ) from error
-        self.system, self.version = system, -1
+        self.system, self.version, self.continuous = system, -1, operator.config.continuous
         self.orders: dict[int, Order] = {}
         self.report: SafetyReport | None = None
         self.acted: Mapping[str, float] | None = None
