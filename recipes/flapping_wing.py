@@ -88,7 +88,8 @@ class Config(rt.RunConfig):
         policy: mlp, or paper (an affine law of the observation with offset: 10 weights for the errors).
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
-            these), or names such as headwind; by default measured+wind for mlp, and else paper.
+            these), or names such as headwind; by default measured+wind for mlp, and else, as with the preset
+            paper, paper.
         task: where the drone flies to: paper (5 m forwards and upwards), or hop (1 m forwards and upwards).
         horizon: length of an episode T_o [s].
         unknown: what the real system has beside its twin, one or more of plane_4.4, plane_6.3, plane_12.6 (slow stroke

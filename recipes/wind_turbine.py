@@ -66,7 +66,8 @@ class Config(rt.RunConfig):
         observe: what the policies observe, by names of sets and of measurements: paper (the errors e1 and e2), errors
             (these and the rotor speed), scheduled (these and what a gain-scheduled law needs), measured (all states),
             measured+wind, preview (these and the wind in 2, 4 and 8 s, as a lidar measures it), or names such as
-            rotor_speed; by default measured+wind for mlp, scheduled for scheduled, and else paper.
+            rotor_speed; by default measured+wind for mlp, scheduled for scheduled, and else paper, as with the
+            preset paper.
         task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
             overspeed, overshoot, the rates of pitch and torque and, by engineering.underspeed, a slow rotor in wind).
         engineering: weights of the task engineering.

@@ -131,6 +131,8 @@ class RunConfig:
                 raise ValueError(f"{name} of {type(self).__name__} hides an option of RunConfig; give it another name.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
+        if self.policy != "mlp" and self.hidden != type(self).hidden:
+            raise ValueError(f"hidden={self.hidden} are widths of an mlp, and policy={self.policy!r} has none.")
         if self.real_unseen == 1:  # no mean of one episode has a confidence interval
             raise ValueError("real_unseen=1 must be 0, or at least 2.")
         if self.log != LogConfig() and self.start in (None, *STARTS):
