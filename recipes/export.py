@@ -1,5 +1,6 @@
 """Export from a run folder: a trained policy, the controller around it, or the twin."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -74,6 +75,10 @@ def main(config: Config) -> None:
             f"role={config.role!r} of this run plans its actions by model predictive control and cannot be exported; "
             "export the model-free policy, which has learned from its records, by --role model_free."
         )
+    acts, finished = {"policy", "controller"} & set(config.what), (config.run / "metrics.json").is_file()
+    refused = run.metrics["summary"]["may_not_act"] if acts and finished else {}
+    if config.role in refused:
+        print(f"warning: {refused[config.role]}", file=sys.stderr)
     output = config.output or config.run / "exported"
     make_folder("output", output)
     for kind in formats:

@@ -74,7 +74,11 @@ def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypa
     assert written == {f"{name}.{suffix}" for name in names for suffix in ("c", "h")}
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 3 and "of the sizes of the states" in printed[2]
-    export.main(export.Config(run=tmp_path, what=("twin",), name="blade", output=tmp_path / "other"))
+    summary = {"live": "model_based", "may_not_act": {"model_based": "model_based may not act: it is dear"}}
+    (tmp_path / "metrics.json").write_text(json.dumps({"episodes": [], "summary": summary}))
+    for what, warning in (("policy", "warning: model_based may not act: it is dear\n"), ("twin", "")):
+        export.main(export.Config(run=tmp_path, what=(what,), name="blade", output=tmp_path / "other"))
+        assert capsys.readouterr().err == warning
     assert "void blade_twin_step(double t," in (tmp_path / "other" / "blade_twin.h").read_text()
 
 

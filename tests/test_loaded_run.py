@@ -37,7 +37,8 @@ def combinations():
 
 @pytest.mark.parametrize(("plant", "closure", "policy"), list(combinations()))
 def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, tmp_path):
-    config, parts = leave_run(tmp_path, plant, policy=policy, closure=closure, hidden=(3,), horizon=3000.0)
+    widths = {"hidden": (3,)} if policy == "mlp" else {}
+    config, parts = leave_run(tmp_path, plant, policy=policy, closure=closure, horizon=3000.0, **widths)
     run = load_run(tmp_path)
     assert run.config == config and set(run.policies) == {"model_based", "model_free"} and run.plant.horizon == 3000.0
     for role, part in parts.items():

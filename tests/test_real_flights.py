@@ -249,9 +249,11 @@ def test_a_policy_that_may_not_act_does_not_fly_when_flights_are_asked_for(tmp_p
                 policy.gain.fill_(-2.0)
 
     run = run_on(rig, tmp_path, real_unseen=2, start="controller", first=PD, callbacks=[destabilise])
-    flown = run.train()["summary"]["real_unseen"]["controllers"]
-    assert [*flown] == ["PD"] and len(rig.flights) == 3 + 2
+    summary = run.train()["summary"]
+    assert [*summary["real_unseen"]["controllers"]] == ["PD"] and len(rig.flights) == 3 + 2
+    assert set(summary["may_not_act"]) == {"model_based", "model_free"}
     said = capsys.readouterr().out
+    assert f"  {summary['may_not_act'][summary['live']]}\n" in said
     assert "does not fly the real system: model_" in said and "next: judge the live policy" not in said
 
 

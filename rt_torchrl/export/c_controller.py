@@ -233,7 +233,8 @@ class CController:
             "",
             *c_file.signal_table({"measured": self.signals, "action": plant.actions, "state.memory": held}),
             "",
-            "The action is what the actuators make of state.command, the command of the policy.",
+            "The action is what the actuators make of state.command, the command of the policy. Check what is measured",
+            "before a step: nothing here refuses a NaN or a reading beyond its range.",
             *(MEMORY if held else []),
         ]
 

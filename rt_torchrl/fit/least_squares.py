@@ -51,7 +51,7 @@ GROWTH = 1e3
 """Factor by which errors of first states grow along the records of a system that is called unstable."""
 ALIKE = 0.5
 """Correlation of neighbouring residuals above which they are no noise."""
-ROUNDED = 1e-4
+ROUNDED = 1e-5
 """RMS error of a sensor, as a share of the scatter of its readings, that is rounding, such as of single precision."""
 DEPARTURE = 3.0
 """Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""

@@ -147,6 +147,7 @@ def summarise(
             "baselines": baselines,
         },
         "live": live,
+        "may_not_act": refused(algorithm),
         "first": None if first is None else {"expected": first.expected, "paid": first.paid},
         "better": better_of(algorithm, unseen),
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
@@ -302,11 +303,19 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
         algorithm: the training at its end.
         untrained: the policies before it.
     """
-    live, interact = algorithm.referee.live, algorithm.steps["interact"]
+    live = algorithm.referee.live
     policy = algorithm.policies[live]
     if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
         return f"{live} has its random initial weights"
-    return interact.supervisor.refusal(live, interact.supervisor.episodes())[0]
+    return refused(algorithm).get(live, "")
+
+
+def refused(algorithm: ReinforcementTwinning) -> dict[Role, str]:
+    """Why policies may not act, by role, at the end of a training."""
+    supervisor = algorithm.steps["interact"].supervisor
+    episodes = supervisor.episodes()
+    reasons = {role: supervisor.refusal(role, episodes)[0] for role in supervisor.policies}
+    return {role: reason for role, reason in reasons.items() if reason}
 
 
 def entries(

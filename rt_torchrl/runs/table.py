@@ -91,7 +91,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines.append(
         f"  paid on the real system: sum of J_a {whole} over {paid['episodes']} episodes{after}, largest {most}"
     )
-    lines += live_lines(summary["live"], episodes)
+    lines += live_lines(summary["live"], episodes, summary["may_not_act"].get(summary["live"], ""))
     lines += [f"  {sentence}" for sentence in [dearer_than_first(summary)] if sentence]
     lines += hypothesis_lines(summary["hypotheses"], summary["believed"])
     # A fit whose residuals are noise has answered the doubts of the first flight.
@@ -108,8 +108,14 @@ def results_table(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines with the policy that is live at the end, what both are expected to cost, and what each half gave."""
+def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]], reason: str = "") -> list[str]:
+    """Lines with the policy that is live at the end, what both are expected to cost, and what each half gave.
+
+    Args:
+        live: role of the policy.
+        episodes: records of the training.
+        reason: why the policy may not act; empty if it may.
+    """
     line, last = f"  live at the end: {live.replace('_', '-')}", episodes[-1]
     if f"expected/{live}" in last:
         cost, other = (_number(last[f"expected/{role}"], ".4g") for role in (live, other_than(live)))
@@ -119,7 +125,8 @@ def live_lines(live: Role, episodes: Sequence[Mapping[str, Any]]) -> list[str]:
     if judged:
         line += f"; updates of model-free that were kept while it was live: {sum(judged):.0f} of {len(judged)}"
     clones = [record["episode"] for record in episodes if record["event"] == "clone"]
-    return [line + (f"; the idle one became a clone after episode {clones[-1]}" if clones else "")]
+    line += f"; the idle one was a clone after episode {clones[-1]}" if clones else ""
+    return [line, *([f"  {reason}"] if reason else [])]
 
 
 def controller_lines(controllers: Mapping[str, Any], where: str, width: int) -> list[str]:
