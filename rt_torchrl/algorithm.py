@@ -159,10 +159,7 @@ class ReinforcementTwinning(TensorDictSequential):
         interact = (Operate if operating else Interact)(flights, supervisor, belief, config)
         assimilation = Assimilation(twin, config.assimilation)
         if isinstance(twin, TwinEnsemble):
-            continues = isinstance(env, Operation) and env.continuous
-            assimilation = EnsembleAssimilation(
-                twin, config.assimilation, config.hypotheses, always=fed_back, continues=continues
-            )
+            assimilation = EnsembleAssimilation(twin, config.assimilation, config.hypotheses, always=fed_back)
         counts = (config.planner.realisations or config.realisations, judged)
         steps: dict[str, Any] = {
             "interact": interact,

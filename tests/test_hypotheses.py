@@ -28,7 +28,7 @@ from rt_torchrl.steps.hypotheses.assimilation import (
     misfit,
     reread,
 )
-from rt_torchrl.steps.hypotheses.ensemble import ALONE, make_twin
+from rt_torchrl.steps.hypotheses.ensemble import ALONE, TwinEnsemble, make_twin
 from rt_torchrl.trajectories.trajectory import batch_of
 
 LAG = 0.6
@@ -193,15 +193,24 @@ def test_hidden_states_go_on_through_the_segments_of_an_unstable_twin():
     assert fit.cost([record.part(0, 7, PLANT.dt)]) < 1e-20  # of an episode that ended before a segment does
 
 
-@pytest.mark.parametrize("continues", [False, True])
-def test_hidden_states_need_not_be_at_rest_where_a_record_does_not_begin_an_episode(continues):
+def test_a_biased_sensor_is_at_rest_by_what_was_found():
+    """The twin's first interval costs what the real system's does, although the suspect began without a bias."""
+    real, suspect = (rt.BiasedSensor(PLANT, "position", bias, scale=0.1) for bias in (0.3, 0.0))
+    twin = TwinEnsemble(PLANT, PLANT.closure, {"bias": suspect}, {"bias": copy.deepcopy(real.closure)})
+    twin.weights, (states, inputs) = {"bias": 1.0}, drawn(real, 3)
+    policy = LinearGain([[1.0, 0.5]])
+    expected = rt.control_cost(real, rt.Rollout(real, real.closure, policy)(states, inputs))
+    torch.testing.assert_close(twin.episode_costs(policy, states[:, :2], inputs), expected)
+
+
+@pytest.mark.parametrize("begin", [lambda record: record, lambda record: record._replace(start=0.0)])
+def test_hidden_states_need_not_be_at_rest_where_a_record_does_not_begin_an_episode(begin):
     """A part of an episode, or a window of a continuous operation, whose clock begins anew: half of it counts."""
     real = rt.LaggedActuator(PLANT, "force", LAG)
-    record = recorded(real)[0].part(20, 100, PLANT.dt)
-    record = record._replace(start=0.0) if continues else record
+    record = begin(recorded(real)[0].part(20, 100, PLANT.dt))
     lagged, wrong = real.closure, copy.deepcopy(real.closure)
     twin = rt.DigitalTwin(real, wrong)
-    fit = Fit(twin, ASSIMILATION, 5, continues=continues)
+    fit = Fit(twin, ASSIMILATION, 5)
     with torch.no_grad():
         wrong.base.matrix.mul_(0.5)
     fit.update([record])

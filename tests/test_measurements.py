@@ -165,6 +165,16 @@ def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unc
     torch.testing.assert_close(seen, torch.tensor([[2.0, 0.25, 0.0, 1.0]]).double(), rtol=0, atol=1e-15)
 
 
+def test_measurements_of_an_object_take_the_place_of_those_of_its_class():
+    class Targeted(Clocked):
+        def __init__(self, target):
+            self.measurements = tuple(rt.Measurement.of(state, offset=target, scale=target) for state in self.states)
+            super().__init__(horizon=2.0)
+
+    at_target = torch.full((1, 2), 0.4, dtype=torch.float64)
+    assert not Targeted(0.4).observe(torch.zeros(1), at_target, torch.zeros(1, 1)).any()
+
+
 # Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode.
 
 

@@ -265,6 +265,11 @@ class Untraceable(LinearQuadratic):
         return super().running_cost(t, state, applied, exogenous)
 
 
+class Ending(LinearQuadratic):
+    def terminal_cost(self, state):
+        return 3.0 * state[..., 0] ** 2
+
+
 def by_rollout(plant, plan, state, exogenous, *, hold=1, start=0.0, penalty=PENALTY):
     """J and its gradient by autograd through every step."""
     n, (low, high) = len(exogenous), bounds(plant.actions)
@@ -274,12 +279,14 @@ def by_rollout(plant, plan, state, exogenous, *, hold=1, start=0.0, penalty=PENA
     flown = rollout(state[None], exogenous[None], command[None], start=start)
     t = start + plant.dt * torch.arange(n, dtype=torch.float64)
     cost = plant.running_cost(t, flown.states[0, :-1], flown.actions[0], exogenous).mean()
+    ends = plant.terminal_cost(flown.states[0])
+    cost = cost + (ends[-1] - ends[0]) / (n * plant.dt)
     cost = cost + penalty * ((command - flown.actions[0]) / (high - low)).square().sum(-1).mean()
     return cost.item(), torch.autograd.grad(cost, u)[0].numpy()
 
 
 @pytest.mark.parametrize("hold, n", [(1, 12), (4, 9)])
-@pytest.mark.parametrize("kind", [WindTurbine, LinearQuadratic, Untraceable])
+@pytest.mark.parametrize("kind", [WindTurbine, LinearQuadratic, Untraceable, Ending])
 def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n):
     plant = kind()
     states, inputs = drawn(plant, 3, 3)

@@ -19,7 +19,7 @@ from test_real_system import Rig, connected
 
 from rt_torchrl import LaggedActuator, PlantEnv, SafetyConfig, SafetyLayer, load_run
 from rt_torchrl.evaluation.unseen import RealController, RealEpisodes
-from rt_torchrl.runs.results import entries
+from rt_torchrl.runs.results import entries, judged_before
 from rt_torchrl.steps.interact import RealFlights
 
 pytestmark = pytest.mark.training
@@ -278,6 +278,10 @@ def test_a_finished_run_that_is_resumed_flies_and_pays_nothing_again(tmp_path):
     again = run_on(rig, tmp_path, real_unseen=2, resume=True).train()["summary"]
     assert len(rig.flights) == 2 + 2 and again["real_unseen"] == first["real_unseen"]
     assert again["cost_of_learning"] == first["cost_of_learning"]
+    episodes = json.loads((tmp_path / "metrics.json").read_text())["episodes"]
+    assert judged_before(tmp_path, episodes) == first["real_unseen"]
+    episodes[1]["real_cost"] += 1e-9  # flown again from an earlier checkpoint, with another outcome
+    assert judged_before(tmp_path, episodes) is None
     # A controller that has not flown yet flies, and so does the policy beside it; what was paid before stays paid.
     run_on(rig, tmp_path, real_unseen=2, resume=True, baselines={"mine": Tracking}).train()
     paid = run_on(rig, tmp_path, resume=True).train()["summary"]["cost_of_learning"]

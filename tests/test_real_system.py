@@ -65,6 +65,11 @@ def connected(plant, *, rig=None, **options):
     return RealSystem(rig or Rig(plant), plant, **options)
 
 
+def test_a_scale_is_not_rounded_to_single_precision():
+    action = Actuation(scale=0.01, offset=293.15).action(torch.tensor([293.16], dtype=torch.float64))
+    assert action.item() == (293.16 - 293.15) / 0.01
+
+
 def test_it_fulfils_its_specs():
     check_env_specs(connected(LinearQuadratic(horizon=1.0)))
 

@@ -12,7 +12,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from small_plants import Envelope, Room, room_records
 from test_export_recipe import recipe
 
-from rt_torchrl import AssimilationConfig, DigitalTwin, Rollout
+from rt_torchrl import AssimilationConfig, DigitalTwin, LaggedActuator, Rollout, StackedObservations
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -257,6 +257,13 @@ def test_hidden_states_are_those_that_the_plant_cannot_complete(kind, states, hi
     assert hidden_states(plant, log) == hidden
     free = [state.name for state, s in zip(plant.states, initial_spread(plant, log), strict=True) if s > 0.0]
     assert sorted(free) == sorted(unknown or [*states, *hidden])
+
+
+def test_a_log_need_not_begin_where_hidden_states_of_actuators_are_at_rest():
+    plant = LaggedActuator(StackedObservations(LinearQuadratic(horizon=2.0), 1), "force", 0.3)
+    spread = initial_spread(plant, log_of(plant, ["position", "velocity"]))
+    known = [state.name for state, s in zip(plant.states, spread, strict=True) if not s]
+    assert known == list(plant.controller_states) and plant.unread == 1
 
 
 def test_samples_between_rows_that_are_too_far_apart_are_missing():

@@ -57,7 +57,7 @@ def test_a_run_is_not_resumed_with_other_options(tmp_path):
     before, default = contents(tmp_path), RunConfig().twinning
     learner = dataclasses.replace(default.learner, actor_rate=1e-3, discount=0.5)
     for options, named in (
-        ({"hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
+        ({"policy": "mlp", "hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
         (
             {"twinning": dataclasses.replace(default, learner=learner)},
             "actor_rate is 0.001 here and was 0.002.*learner.discount is 0.5",

@@ -121,8 +121,8 @@ class Cubic(LinearClosure):
 def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path):
     speed = (*LinearQuadratic.observations[:1], rt.Signal(symbol="v", name="speed", unit="-"))
     for changed, options, message in (
-        ({"name": "other"}, {}, "whose name is linear_quadratic; here it is other"),
-        ({"observations": speed}, {}, "whose observations is .*velocity_error"),
+        ({"name": "other"}, {}, "whose plant is linear_quadratic; here it is other"),
+        ({"observations": speed}, {}, "whose observation is .*velocity_error"),
         ({}, {"closure": "mlp"}, r"whose closure does not fit that of this run"),
         ({"make_closure": lambda self, generator: Cubic(self.true_closure)}, {}, "is LinearClosure; here it is Cubic"),
     ):

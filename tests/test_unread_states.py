@@ -227,6 +227,13 @@ def test_a_real_system_that_reports_the_states_of_the_plant_alone():
         assert found["done"].all()
 
 
+@pytest.mark.parametrize("name", ["lag", "delay"])
+def test_noise_of_sensors_leaves_what_no_sensor_reads(name):
+    plant = EXTENSIONS[name](BASE)
+    factor = rt.PlantEnv(plant, noise=0.3, seed=4).sensor_factor()
+    assert (factor[:, :2] != 1.0).all() and (factor[:, 2:] == 1.0).all() and factor.shape[1] == len(plant.states)
+
+
 def test_past_observations_are_what_sensors_read_then():
     """Noise falls on a measurement once: what a policy remembers of it gets no other one."""
     noise = 0.3

@@ -2,7 +2,8 @@ r"""The cost of held commands and its exact gradient, and its bounded descent.
 
 .. math::
     J(u) = \frac1N\sum_{k<N}\Big(L_a(t_k, s_k, a_k, z_k)
-        + w\sum_i\Big(\frac{c_{k,i} - a_{k,i}}{h_i - l_i}\Big)^2\Big), \qquad
+        + w\sum_i\Big(\frac{c_{k,i} - a_{k,i}}{h_i - l_i}\Big)^2\Big)
+        + \frac{\Phi_a(s_N) - \Phi_a(s_0)}{N\Delta t}, \qquad
     c_k = l + (h - l)\,u_{\lfloor k/m\rfloor}
 
 The commands c lie between the ends l and h of their ranges, and each is held for m control intervals. A command beyond
@@ -38,7 +39,9 @@ PAIRS = 10
 
 
 class PenalisedInterval(nn.Module):
-    """A control interval whose state (s, J) also sums L_a and the penalty; its drive holds commands in [0, 1].
+    """A control interval whose state (s, J) also sums L_a, what Φ_a/Δt gains, and the penalty.
+
+    Its drive holds commands in [0, 1].
 
     Args:
         plant: the physics, whose actions have finite ranges.
@@ -59,6 +62,7 @@ class PenalisedInterval(nn.Module):
         excess = ((command - applied) / self.span).square().sum(-1)
         cost = self.plant.running_cost(drive.t, s, applied, drive.exogenous) + PENALTY * excess
         end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        cost = cost + (self.plant.terminal_cost(end) - self.plant.terminal_cost(s)) / self.plant.dt
         return torch.cat([end, (state[..., -1] + cost).unsqueeze(-1)], -1)
 
 

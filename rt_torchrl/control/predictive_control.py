@@ -74,7 +74,7 @@ class Solve(NamedTuple):
 class RecedingHorizon:
     r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
 
-    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' \quad\text{from the measured state, under a forecast of z}
+    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + \Phi_a(s_{t+H}) \quad\text{from what is measured, under a forecast of z}
 
     Every plan starts from the rest of the last one, whose end is held; the first plan of an episode starts from the
     best constant command.

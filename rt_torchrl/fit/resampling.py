@@ -238,11 +238,13 @@ def filled(log: SensorLog, plant: Plant, guesses: Mapping[str, float] | None = N
 
 
 def initial_spread(plant: Plant, log: SensorLog) -> Float[Tensor, " n_s"]:
-    """Spread of the initial states of a log's segments: zero for those that the plant completes, infinite for others.
+    """Spread of the initial states of a log's segments: zero for those that the controller computes, else infinite.
 
-    Initial values of states that are logged or hidden are unknown; those that follow from others are not.
+    A log need not begin where states that no sensor reads are at rest.
     """
+    unread = plant.states[len(plant.readings) :]
     unknown = {*hidden_states(plant, log), *(state.name for state in logged_states(plant) if state.name in log.columns)}
+    unknown |= {state.name for state in unread if state.name not in plant.controller_states}
     return torch.tensor([float("inf") if s.name in unknown else 0.0 for s in plant.states], dtype=torch.float64)
 
 

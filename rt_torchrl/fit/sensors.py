@@ -186,7 +186,7 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
 
     A trajectory has no inputs in its last sample, and so no readings there of sensors that depend on them.
     """
-    states, actions, exogenous, start, seen = batch
+    states, actions, exogenous, start, seen, _ = batch
     first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(len(states))
     t = first.unsqueeze(-1) + plant.dt * torch.arange(states.shape[1], dtype=torch.float64, device=states.device)
     exogenous = pad(exogenous, (0, 0, 0, 1), value=math.nan)

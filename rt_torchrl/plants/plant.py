@@ -123,15 +123,14 @@ class Plant(nn.Module):
         self.n_steps = whole_steps(self.name, dt, horizon)
         self.dt = float(dt)
         self.closure = closure
-        self.observed = self.chosen(observe)
+        self.observed = self._chosen(observe)
         self.previews = tuple(m.read for m in self.observed if isinstance(m.read, Preview))
         if self.observed:
             self.observations = tuple(measurement.observation for measurement in self.observed)
         if self.previews:
             self.inputs = (*self.inputs, *(m.signal for m in self.observed if m.read in self.previews))
 
-    @classmethod
-    def chosen(cls, observe: Sequence[str]) -> tuple[Measurement, ...]:
+    def _chosen(self, observe: Sequence[str]) -> tuple[Measurement, ...]:
         """The measurements that policies observe, each once and in the order in which they are asked for.
 
         Args:
@@ -141,14 +140,14 @@ class Plant(nn.Module):
             ValueError: if there is no such measurement or set.
         """
         if isinstance(observe, str):
-            raise ValueError(f"observe={observe!r} of plant {cls.name!r} must be a sequence of names, not a text.")
-        known, sets = {measurement.name: measurement for measurement in cls.measurements}, cls.observation_sets
+            raise ValueError(f"observe={observe!r} of plant {self.name!r} must be a sequence of names, not a text.")
+        known, sets = {measurement.name: measurement for measurement in self.measurements}, self.observation_sets
         observe = observe or tuple(sets)[:1] or tuple(known)
         names = dict.fromkeys(name for word in observe for name in sets.get(word, (word,)))
         unknown = [name for name in names if name not in known]
         if unknown:
             raise ValueError(
-                f"observe={tuple(observe)} of plant {cls.name!r}: {', '.join(unknown)} does not exist; choose among "
+                f"observe={tuple(observe)} of plant {self.name!r}: {', '.join(unknown)} does not exist; choose among "
                 f"the sets {', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
             )
         return tuple(known[name] for name in names)

@@ -34,7 +34,7 @@ class SensorErrors(nn.Module):
         self.scale, self.duration = scale, duration
         self.names = {f"{state}_offset": unit, f"{state}_drift": f"{unit}/s"}
         self.meanings = {f"{state}_offset": "offset of the sensor", f"{state}_drift": "drift of the sensor"}
-        self.weights = nn.Parameter(torch.tensor([offset / scale, drift * duration / scale]).double())
+        self.weights = nn.Parameter(torch.tensor([offset / scale, drift * duration / scale], dtype=torch.float64))
 
     def named_coefficients(self) -> dict[str, Tensor]:
         """Offset and drift by name."""
@@ -111,7 +111,7 @@ class BiasedSensor(Extension):
         return self.true(readings, hidden[..., 0])
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Hidden:
-        """The bias at the start as the true system has it; a twin's states hold its own from the first interval on."""
+        """The bias at the start as the plant's own closure has it."""
         return self.closure.get_submodule("own")(torch.zeros_like(base[..., 0])).unsqueeze(-1)
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.atomic_file import finite
 from rt_torchrl.evaluation.law import asked_features, name_of, varying
 from rt_torchrl.evaluation.unseen import (
     Baseline,
@@ -349,13 +350,13 @@ def _same_episode(flown: Trajectory, other: Trajectory) -> bool:
     return torch.equal(flown.states[0], other.states[0]) and torch.equal(flown.exogenous[:n], other.exogenous[:n])
 
 
-def judged_before(folder: Path, episodes: int) -> dict[str, Any] | None:
-    """The entry ``real_unseen`` that an earlier end of a run has left after as many episodes; None without."""
+def judged_before(folder: Path, episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """The entry ``real_unseen`` that an earlier end of a run has left after the same episodes; None without."""
     if not (folder / "metrics.json").is_file():
         return None
     metrics = read_metrics(folder)
     entry: dict[str, Any] | None = metrics["summary"].get("real_unseen")
-    return entry if len(metrics["episodes"]) == episodes else None
+    return entry if metrics["episodes"] == finite(list(episodes)) else None
 
 
 def paid_before(folder: Path) -> list[float | None]:

@@ -303,7 +303,7 @@ class Run:
         """
         count, live = self.config.real_unseen, self.algorithm.referee.live
         interrupted = len(self.episodes) < self.config.episodes and self.ended is None
-        earlier = results.judged_before(self.folder, len(self.episodes))
+        earlier = results.judged_before(self.folder, self.episodes)
         if not count or interrupted:
             return earlier
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Baseline, RealController, TwinEpisodes, UnseenEpisodes
+from rt_torchrl.export.program import interface
 from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
 from rt_torchrl.plants.plant import Plant
@@ -27,7 +28,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
-from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length
+from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length, until_end
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -70,9 +71,8 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> EarlierPolicies:
     where, kind = f"start={str(folder)!r} is a run", type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
     closure, hypotheses = config.make_closure(plant, torch.Generator()), None
-    compared = {
-        what: (getattr(run.physics, what), getattr(plant, what)) for what in ("name", "observations", "actions")
-    }
+    earlier_ends, ends = interface(run.physics), interface(plant)  # offsets and scales of observations, too
+    compared = {what: (earlier_ends[what], ends[what]) for what in ("plant", "observation", "action")}
     # Weights of the same shapes may be those of another law.
     compared["closure"] = type(run.closure).__name__, type(closure).__name__
     for what, (earlier, present) in compared.items():
@@ -108,7 +108,8 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> RecordedFlights:
     # A learner sums the rewards of several intervals.
     shortest = max(SHORTEST, config.twinning.learner.return_steps)
     segments = resample(log, physics, gap=options.gap, shortest=shortest).segments
-    records = pieces_of_equal_length(segments, physics.n_steps, physics.dt)
+    flown = [until_end(physics, segment) for segment in segments if not physics.ended(segment.states[0])]
+    records = pieces_of_equal_length(flown, physics.n_steps, physics.dt)
     return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
 
 

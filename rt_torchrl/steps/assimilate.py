@@ -188,7 +188,7 @@ class Assimilation:
         return identification_cost(self.twin.plant, flown, replayed.states, replayed.seen).mean()
 
     def _flown(self, replayed: Trajectory) -> Trajectory:
-        states, actions, exogenous, start, seen = replayed
+        states, actions, exogenous, start, seen, _ = replayed
         return self.twin.replay(states[:, 0], exogenous, actions, start=start)._replace(seen=seen)
 
     @torch.no_grad()

@@ -130,6 +130,7 @@ class RealFlights:
         parts = [_transitions(episode, part) for part in sound.parts]
         transitions = parts[sound.parts.index((first, last))]
         record = Trajectory(states, rows["next", "applied"], rows["exogenous"], first * self.plant.dt)
+        record = record._replace(from_rest=first == 0 and not (isinstance(self.env, Operation) and self.env.continuous))
         after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if sound.whole else (0, 0.0)
         if self.check is not None:
             check, self.check = self.check, None
@@ -325,7 +326,7 @@ class Interact(Step):
     def forward(self, episode: TensorDictBase) -> TensorDictBase:
         """Take the step."""
         flights, report = self.take(episode["live"], int(episode["number"]))
-        states, actions, exogenous, start, _ = flights[-1].record
+        states, actions, exogenous, start, *_ = flights[-1].record
         parts = [part for flight in flights for part in flight.parts]
         like = functools.partial(torch.as_tensor, device=states.device)
         clock = {"start": like(start, dtype=torch.float64), "whole": like(flights[-1].whole)}

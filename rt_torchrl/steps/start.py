@@ -132,11 +132,11 @@ class RecordedFlights(Start):
 
     Args:
         plant: plant of the records.
-        records: records of equal length, oldest first; at least one.
+        records: records of equal length, oldest first; at least one. Nothing tells whether they begin from rest.
     """
 
     def __init__(self, plant: Plant, records: Sequence[Trajectory]):
-        self.plant, self.records = plant, records
+        self.plant, self.records = plant, [record._replace(from_rest=False) for record in records]
 
     def flights(self, fly: Fly) -> list[Flight]:
         flown = [(transitions_of(self.plant, record), record) for record in self.records]
@@ -151,7 +151,7 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
     The last one is truncated, unless the episode ends there early, and pays the terminal cost if it ends there or the
     record is as long as an episode.
     """
-    states, actions, inputs, start, _ = record
+    states, actions, inputs, start, *_ = record
     n = len(actions)
     t = start + plant.dt * torch.arange(n + 1, dtype=torch.float64, device=states.device)
     # There is no input after the last interval; the last input takes its place.

@@ -138,12 +138,13 @@ class PlantEnv(EnvBase):
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def sensor_factor(self) -> Float[Tensor, "1 n_s"]:
-        """The sensors' factors on the state at the next reading, 1 + noise·w."""
+        """The sensors' factors on the state at the next reading, 1 + noise·w; 1 for what no sensor reads."""
         shape, like = (1, len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
         drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
         read = [signal.name not in self.plant.memories for signal in self.plant.states]
+        read[len(self.plant.readings) :] = [False] * self.plant.unread
         return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
 
     def _now(self) -> tuple[Float[Tensor, " 1"], Float[Tensor, "1 n_z"]]:

@@ -107,7 +107,7 @@ class Actuation:
 
     def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """The environment's action for a command in the plant's units."""
-        scale, offset = (torch.as_tensor(x).to(command) for x in (self.scale, self.offset))
+        scale, offset = (torch.as_tensor(x, dtype=torch.float64).to(command) for x in (self.scale, self.offset))
         return (command - offset) / scale
 
 

@@ -27,6 +27,7 @@ class Trajectory(NamedTuple):
         start: time of s_0 on the plant's clock [s], one for all trajectories or one for each.
         seen: whether the state of each sample was measured; None if all were. Other states, such as those between the
             rows of a slow log, are interpolated, and no fit compares them.
+        from_rest: whether states that no sensor reads are at rest in s_0, as where an episode begins.
     """
 
     states: Float[Tensor, "*batch n+1 n_s"]
@@ -34,6 +35,7 @@ class Trajectory(NamedTuple):
     exogenous: Float[Tensor, "*batch n n_z"]
     start: float | Float[Tensor, " batch"] = 0.0
     seen: Bool[Tensor, "*batch n+1"] | None = None
+    from_rest: bool = True
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
         """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
@@ -42,7 +44,7 @@ class Trajectory(NamedTuple):
 
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
-        states, actions, exogenous, start, seen = self
+        states, actions, exogenous, start, seen, from_rest = self
         steps, samples = slice(first, last), slice(first, last + 1)
         return Trajectory(
             states[..., samples, :],
@@ -50,6 +52,7 @@ class Trajectory(NamedTuple):
             exogenous[..., steps, :],
             start + first * dt,
             None if seen is None else seen[..., samples],
+            from_rest and first == 0,
         )
 
     def segments(self, length: int, dt: float) -> "Trajectory":
@@ -59,7 +62,7 @@ class Trajectory(NamedTuple):
             length: number of control intervals of a segment; a shorter rest at the end is dropped.
             dt: control interval [s].
         """
-        states, actions, exogenous, start, seen = self
+        states, actions, exogenous, start, seen, _ = self
 
         def pieces(samples: Tensor, size: int) -> Tensor:
             return samples.unfold(1, size, length).flatten(0, 1).movedim(-1, 1).contiguous()
@@ -128,7 +131,7 @@ def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"
 
     Where it ends early, it costs L_e from there on, and Φ_a is that of the state in which it ended.
     """
-    states, actions, exogenous, start, _ = trajectory
+    states, actions, exogenous, start, *_ = trajectory
     n = actions.shape[-2]
     clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock

@@ -106,14 +106,13 @@ class Reread(Extension):
         return self.base.step(t, torch.cat([start, hidden], -1), command, inputs, closure)
 
 
-def reread(record: Trajectory, plant: Plant, segment: int, *, continues: bool = False) -> Trajectory:
+def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
     """A record as a :class:`Reread` plant replays it, with the readings at the start of every segment.
 
     Args:
         record: the record, as sensors read it.
         plant: the plant; its hidden states are at rest at the start.
         segment: number of control intervals of a segment.
-        continues: see :func:`settled`.
     """
     read = record.states[:-1]
     flag = torch.zeros_like(read[:, :1])
@@ -124,19 +123,15 @@ def reread(record: Trajectory, plant: Plant, segment: int, *, continues: bool = 
         starts = measured[place[place < len(measured)]]
     flag[starts] = 1.0
     exogenous = torch.cat([record.exogenous, read, flag], -1)
-    return settled(record, continues)._replace(states=plant.at_rest(record.states), exogenous=exogenous)
+    return settled(record)._replace(states=plant.at_rest(record.states), exogenous=exogenous)
 
 
-def settled(record: Trajectory, continues: bool) -> Trajectory:
-    """A record in which no sample is seen before hidden states have settled.
+def settled(record: Trajectory) -> Trajectory:
+    """A record in which no sample is seen before hidden states have settled, which are not always at rest at its start.
 
-    They are at rest where an episode begins, and not where a later part of it does.
-
-    Args:
-        record: the record.
-        continues: whether records begin where others have ended, as the windows of a continuous operation do.
+    They are not where a later part of an episode begins, a window of a continuous operation, or a log.
     """
-    if not continues and not float(record.start):
+    if record.from_rest:
         return record
     seen = torch.ones_like(record.states[..., 0], dtype=torch.bool) if record.seen is None else record.seen.clone()
     seen[: int(RUN_UP * len(seen))] = False
@@ -153,11 +148,10 @@ class Fit:
         twin: twin of the hypothesis, whose closure is updated in place.
         config: parameters of step 4.
         segment: number of control intervals of a segment.
-        continues: see :func:`settled`.
     """
 
-    def __init__(self, twin: DigitalTwin, config: AssimilationConfig, segment: int, *, continues: bool = False):
-        self.twin, self.segment, self.continues = twin, segment, continues
+    def __init__(self, twin: DigitalTwin, config: AssimilationConfig, segment: int):
+        self.twin, self.segment = twin, segment
         short = AssimilationConfig(iterations=STEPS, prior=config.prior, segment=0, initial="measured")
         self.short = Assimilation(twin.of(Reread(twin.plant)), short)
         measured = dataclasses.replace(config, inputs="record", segment=config.segment or 0)
@@ -198,28 +192,23 @@ class Fit:
             The misfit of the best weights, which the closure has then, and whether the steps have arrived.
         """
         plant, closure = self.twin.plant, self.twin.closure
-        least, best = self.misfit(records), copy.deepcopy(closure.state_dict())
+        least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         shown = least if math.isfinite(least) else self.least
         if self._held and math.isfinite(shown):  # see HELD
             self.short.prior.stiffness = HELD * shown
-        read_again = [reread(record, plant, self.segment, continues=self.continues) for record in records]
-        steps = STEPS
+        read_again, steps = [reread(record, plant, self.segment) for record in records], STEPS
         while stages and steps == STEPS:
             safe_point()
             stages -= 1
             with contextlib.suppress(FloatingPointError):  # a twin that diverges on the way only loses the stage
                 steps = self.short.update(read_again).iterations
-            present = self.misfit(records)
+            present = misfit(self.twin, records, self.segment)
             if present < least:
                 least, best = present, copy.deepcopy(closure.state_dict())
             elif not present < FAR * least:
                 closure.load_state_dict(best)
         closure.load_state_dict(best)
         return least, steps < STEPS
-
-    def misfit(self, records: Sequence[Trajectory]) -> float:
-        """See :func:`misfit`."""
-        return misfit(self.twin, records, self.segment, continues=self.continues)
 
     def cost(self, records: Sequence[Trajectory]) -> float:
         """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
@@ -231,7 +220,7 @@ class Fit:
         All begin where these have settled.
         """
         complete, n = [self.twin.completed(record) for record in records], len(records[0].actions)
-        first = int(RUN_UP * n) if self.continues or any(float(record.start) for record in records) else 0
+        first = 0 if all(record.from_rest for record in records) else int(RUN_UP * n)
         return [record.part(first, n, self.twin.plant.dt) for record in complete]
 
     def state_dict(self) -> dict[str, Any]:
@@ -246,9 +235,9 @@ class Fit:
 
 
 @torch.no_grad()
-def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int, *, continues: bool = False) -> float:
+def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
-    stacked = batch_of([settled(record, continues) for record in records])
+    stacked = batch_of([settled(record) for record in records])
     try:
         if twin.plant.unread:  # hidden states follow from the readings of every interval
             hidden = torch.stack([twin.followed(record)[:, stacked.states.shape[-1] :] for record in records])
@@ -282,7 +271,6 @@ class EnsembleAssimilation(Assimilation):
         hypotheses: parameters of the hypotheses.
         always: whether the twin alone is fitted in every episode, because state feedback plans on it; otherwise it
             rests as any other hypothesis that explains nothing.
-        continues: see :func:`settled`.
     """
 
     def __init__(
@@ -292,16 +280,11 @@ class EnsembleAssimilation(Assimilation):
         hypotheses: HypothesesConfig,
         *,
         always: bool = False,
-        continues: bool = False,
     ):
         super().__init__(twin, config)
-        self.ensemble, self.hypotheses, self.continues = twin, hypotheses, continues
+        self.ensemble, self.hypotheses = twin, hypotheses
         self.segment = max(2, twin.plant.n_steps // SHORT)
-        self.fits = {
-            name: Fit(suspect, config, self.segment, continues=continues)
-            for name, suspect in twin.twins.items()
-            if name != ALONE
-        }
+        self.fits = {name: Fit(suspect, config, self.segment) for name, suspect in twin.twins.items() if name != ALONE}
         self.always, self.turns = always, {name: Turns() for name in twin.twins}
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call or set(twin.weights) != {ALONE}
@@ -343,12 +326,12 @@ class EnsembleAssimilation(Assimilation):
     def _weigh(self) -> None:
         """Fit the hypotheses to the records of the last update, and weigh them."""
         records = self._records
-        self.misfits = {ALONE: misfit(self.ensemble.twins[ALONE], records, self.segment, continues=self.continues)}
+        self.misfits = {ALONE: misfit(self.ensemble.twins[ALONE], records, self.segment)}
         for name, fit in self.fits.items():
             if self.turns[name].due():
                 self.misfits[name] = fit.update(records, self.length)
             else:
-                self.misfits[name] = fit.misfit(records)
+                self.misfits[name] = misfit(fit.twin, records, self.segment)
         shares = evidence(self.misfits)
         for name, turns in self.turns.items():
             turns.rest(hopeless=shares[name] < HOPELESS)
