@@ -1,7 +1,7 @@
 """Trajectories of a system, the scenarios that they start from, and their costs."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,7 +39,8 @@ class Trajectory(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
         """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
-        changed = {name: change(part) for name, part in self._asdict().items() if isinstance(part, Tensor)}
+        parts = self._asdict().items()
+        changed: dict[str, Any] = {name: change(part) for name, part in parts if isinstance(part, Tensor)}
         return self._replace(**changed)
 
     def part(self, first: int, last: int, dt: float) -> "Trajectory":

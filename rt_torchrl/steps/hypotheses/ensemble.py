@@ -56,10 +56,10 @@ class TwinEnsemble(DigitalTwin):
                 raise ValueError(f"hypothesis {name!r} must extend the twin's plant {plant.name!r}, which it does not.")
         self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine)}
         for name, suspect in suspects.items():
-            extended, law = suspect, closures[name]
+            law, extended = closures[name], suspect
             while extended is not plant and isinstance(extended, Extension):  # what is at rest is so by what was found
                 extended.closure = law
-                extended, law = extended.base, extended.of_base(law)
+                law, extended = extended.of_base(law), extended.base
             self.twins[name] = DigitalTwin(suspect, closures[name], engine=able(engine, suspect))
         self.weights: dict[str, float] = {ALONE: 1.0}
         """Weights of the hypotheses that are planned on; they sum to one."""
