@@ -238,19 +238,25 @@ class Belief:
             None where no controller flew first or it cost nothing, the twin alone has the word, or the policy is state
             feedback, which plans on the twin while it acts.
         """
-        paid = sum(flight.cost for flight in self.first) / max(1, len(self.first))
+        flights = self.first if others is None else self.first[-len(others.initial_state) :]
+        paid = sum(flight.cost for flight in flights) / max(1, len(flights))
         if controller is None or not self.corrects or paid == 0.0 or isinstance(policy, StateFeedback):
             return None
-        theirs = [self.virtual.repeated(flight.trajectory) for flight in self.first]
+        theirs = [self.virtual.repeated(flight.trajectory) for flight in flights]
         episodes = theirs if others is None else [*theirs, others]
 
-        def on_twin(module: nn.Module, episodes: Sequence[Scenario]) -> float:
-            return sum(self.virtual.cost(module, episode) for episode in episodes) / len(episodes)
+        def of_controller(episode: Scenario) -> float:
+            which = f"first {episode.initial_state.sum():.17g} {episode.exogenous.sum():.17g}"
+            cost: float = self._kept(which, lambda: self.virtual.cost(controller, episode))
+            return cost
 
-        cost = on_twin(policy, episodes)
+        def on_twin(cost_of: Callable[[Scenario], float], episodes: Sequence[Scenario]) -> float:
+            return sum(map(cost_of, episodes)) / len(episodes)
+
+        cost = on_twin(partial(self.virtual.cost, policy), episodes)
         if self.flown and others is None:
             return BesideFirst(self.expected(policy, cost), paid)
-        predicted, rival = on_twin(controller, theirs), on_twin(controller, episodes)
+        predicted, rival = on_twin(of_controller, theirs), on_twin(of_controller, episodes)
         if not (0.0 < predicted < math.inf and rival < math.inf):
             return BesideFirst(math.inf, paid)
         error = paid / predicted

@@ -266,12 +266,14 @@ class Supervisor:
         share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
-        known = self.belief.beside_first(policy, self.controller)
-        if known is not None and not (self.belief.flown and known.expected <= EQUAL * known.paid):
-            episodes = self.episodes() if episodes is None else episodes
+        tried = bool(self.belief.flown)
+        known = self.belief.beside_first(policy, self.controller) if tried else None
+        if not tried or (known is not None and known.expected > EQUAL * known.paid):
             few = affordable(self.controller, self.count)
-            others = None if episodes is None else Scenario(*(values[:few] for values in episodes))
-            known = self.belief.beside_first(policy, self.controller, others)
+            if not tried or few == self.count:  # a slow controller flies on the twin for untried policies alone
+                episodes = self.episodes() if episodes is None else episodes
+                others = None if episodes is None else Scenario(*(values[:few] for values in episodes))
+                known = self.belief.beside_first(policy, self.controller, others)
         if known is None or known.expected <= (EQUAL if known.right else TWICE) * known.paid:
             return "", share
         expected, paid = map(in_words, known[:2])
