@@ -30,7 +30,7 @@ from ruler import RECIPES, kept, span, train
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from torch import nn
 
-from rt_torchrl import control_cost, load_run
+from rt_torchrl import load_run
 from rt_torchrl.evaluation.unseen import RealEpisodes
 
 sys.path.insert(0, str(RECIPES))
@@ -221,7 +221,7 @@ class Comparison:
     def cost(self, policy):
         """Mean J_a of the episodes that judge."""
         episodes = RealEpisodes(self.recipe.real_system(self.plant), self.judged)
-        return control_cost(self.plant, episodes.fly(policy)).mean().item()
+        return episodes.control_costs(policy).mean().item()
 
     def trained(self, seed):
         """The folder of the recipe's training with default options, and the seconds of its process."""

@@ -10,7 +10,7 @@ from test_classical import PD
 from rt_torchrl import AssimilationConfig, FirstController, LearnerConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.runs.results import first_there
 from rt_torchrl.steps.switch import Imitation
-from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 
 pytestmark = pytest.mark.training
 
@@ -123,6 +123,12 @@ def test_a_policy_is_compared_in_the_very_episodes_of_the_controller():
     assert torch.equal(found.generator.get_state(), before)
     ratio = on_twin(policy, others) / on_twin(teacher, others)
     assert belief.beside_first(policy, teacher, others)[:2] == pytest.approx((paid * ratio, paid))
+    starts = torch.tensor([[[0.1, -0.1]], [[0.3, -0.3]]]).double()  # whose sums are equal, and whose costs are not
+    for start in starts:
+        others = Scenario(start, torch.zeros(1, 20, 1).double())
+        ratio = on_twin(policy, others) / on_twin(teacher, others)
+        assert belief.beside_first(policy, teacher, others).expected == pytest.approx(paid * ratio)
+    others = supervisor.episodes()
     belief.append(record, "model_based", paid)
     expected = belief.expected(policy, on_twin(policy))
     assert belief.beside_first(policy, teacher)[:2] == pytest.approx((expected, paid))

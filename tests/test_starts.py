@@ -17,6 +17,7 @@ from test_hypotheses import LAG, Suspecting
 import rt_torchrl as rt
 from rt_torchrl.steps.start import RecordedFlights, transitions_of
 from rt_torchrl.steps.switch import clones
+from rt_torchrl.trajectories.trajectory import between_ends
 
 pytestmark = pytest.mark.training
 
@@ -181,6 +182,18 @@ def test_model_predictive_control_flies_first(tmp_path):
     report, controlled = (training(tmp_path / s, plant, start=s).algorithm.start() for s in ("mpc", "controller"))
     assert report["start_cost"] < 0.9 * controlled["start_cost"] and report["start_error_model_free"] < 0.02
     assert report["start_cost_ratio_model_free"] < 1.02
+
+
+def test_a_log_is_cut_where_an_episode_of_it_has_ended():
+    """What lies on the ground is no flight; what comes after it is another one."""
+    plant = test_early_ends.Falling()
+    places = [0.2, 0.6, 1.2, 1.3, 0.4, 0.5, 0.3, 1.1]
+    states = torch.tensor([[place, 0.0] for place in places], dtype=torch.float64)
+    log = rt.Trajectory(states, torch.zeros(7, 1).double(), torch.zeros(7, 1).double(), 5.0)
+    first, second = between_ends(plant, log)
+    assert first.states[:, 0].tolist() == places[:3] and second.states[:, 0].tolist() == places[4:]
+    assert [part.start for part in (first, second)] == [5.0, 5.0 + 4 * plant.dt]
+    assert not between_ends(plant, log._replace(states=states + 2.0))
 
 
 class Ending(LinearQuadratic):

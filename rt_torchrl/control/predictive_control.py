@@ -257,9 +257,14 @@ class PredictiveControl(nn.Module):
         return beside.fly(initial_state, exogenous, closure, plant=plant)
 
     def report(self) -> dict[str, float]:
-        """Wall-clock times of the solves [ms], and the number of those that diverged."""
+        """Wall-clock times of the solves since the last report [ms], and the number of those that diverged.
+
+        Nothing if there was none, as in a window that failed before the next plan was due.
+        """
         solves = self.solves.copy()
         self.solves.clear()  # an operation that is not reset begins no episode
+        if not solves:
+            return {}
         seconds = [solve.seconds for solve in solves]
         return {
             "solve_median": 1e3 * statistics.median(seconds),

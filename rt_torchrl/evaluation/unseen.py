@@ -123,8 +123,12 @@ class UnseenEpisodes:
     def control_costs(self, policy: nn.Module) -> Costs:
         """J_a of each episode."""
         if self.closure is None or isinstance(policy, StateFeedback):
-            return control_cost(self.flying, self.fly(policy))
+            return self.costs_of(self.fly(policy))
         return self.rollout(policy).costs(self.initial_state, self.exogenous)
+
+    def costs_of(self, flown: Trajectory) -> Costs:
+        """J_a of each of the flown episodes."""
+        return control_cost(self.flying, flown)
 
     def validation(self, times: int = 1) -> "UnseenEpisodes | None":
         """Validation episodes: so many times as many, with other draws; None if nobody knows the closure.
@@ -141,9 +145,8 @@ class UnseenEpisodes:
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities in flown episodes."""
         plant = self.flying
-        costs = control_cost(plant, flown)
         merit = plant.merit(flown.states, flown.actions, flown.exogenous)
-        return Judged(costs, merit | (self.bounds.merit(flown.states) if self.bounds else {}))
+        return Judged(self.costs_of(flown), merit | (self.bounds.merit(flown.states) if self.bounds else {}))
 
     @torch.no_grad()
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory, segment: int = 0) -> Costs:
@@ -321,10 +324,9 @@ class RealEpisodes(UnseenEpisodes):
         self._flights.append((whole, costs, [len(record.actions) for record in flown]))
         return whole
 
-    def judge(self, flown: Trajectory) -> "Judged":
-        """J_a as the system measured it, and the plant's own quantities, in episodes that were flown here."""
-        costs = next(costs for known, costs, _ in self._flights if known is flown)
-        return super().judge(flown)._replace(control_costs=costs)
+    def costs_of(self, flown: Trajectory) -> Costs:
+        """J_a of each of the episodes that were flown here, as the system measured it."""
+        return next(costs for known, costs, _ in self._flights if known is flown)
 
     def to_their_end(self, flown: Trajectory) -> list[Trajectory]:
         """The flown episodes one by one, each to the end that the system had, which noisy readings need not show."""

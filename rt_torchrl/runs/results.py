@@ -111,6 +111,7 @@ def summarise(
     judged: dict[str, Judged],
     initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
+    refusals: Mapping[Role, str],
 ) -> dict[str, Any]:
     """What the entry ``summary`` of ``metrics.json`` says of twin and policies.
 
@@ -148,7 +149,7 @@ def summarise(
             "baselines": baselines,
         },
         "live": live,
-        "may_not_act": refused(algorithm),
+        "may_not_act": dict(refusals),
         "first": None if first is None else {"expected": first.expected, "paid": first.paid},
         "better": better_of(algorithm, unseen),
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
@@ -294,7 +295,12 @@ def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
     return dict(total)
 
 
-def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Mapping[Role, nn.Module]) -> str:
+def grounded(
+    config: RunConfig,
+    algorithm: ReinforcementTwinning,
+    untrained: Mapping[Role, nn.Module],
+    refusals: Mapping[Role, str],
+) -> str:
     """Why the live policy does not fly the real system after the training; empty if it does.
 
     It does not where it still has the random weights that it began with, and where it may not act.
@@ -303,18 +309,19 @@ def grounded(config: RunConfig, algorithm: ReinforcementTwinning, untrained: Map
         config: options of the run.
         algorithm: the training at its end.
         untrained: the policies before it.
+        refusals: why policies may not act, see :func:`refused`.
     """
     live = algorithm.referee.live
     policy = algorithm.policies[live]
     if config.start == "random" and not isinstance(policy, StateFeedback) and clones(policy, untrained[live]):
         return f"{live} has its random initial weights"
-    return refused(algorithm).get(live, "")
+    return refusals.get(live, "")
 
 
 def refused(algorithm: ReinforcementTwinning) -> dict[Role, str]:
     """Why policies may not act, by role, at the end of a training."""
     supervisor = algorithm.steps["interact"].supervisor
-    episodes = supervisor.episodes()
+    episodes = supervisor.checked()
     reasons = {role: supervisor.refusal(role, episodes)[0] for role in supervisor.policies}
     return {role: reason for role, reason in reasons.items() if reason}
 

@@ -242,11 +242,11 @@ class Run:
             laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
             flights = results.flights_of(self.unseen, self.algorithm.policies, laws)
             judged = {name: self.unseen.judge(flown) for name, flown in flights.items()}
-            real = self._fly_the_real_system(bar)
+            refusals = results.refused(self.algorithm)
+            real = self._fly_the_real_system(bar, refusals)
             judging = time.perf_counter() - began
-            summary = results.summarise(
-                self.algorithm, self.unseen, flights, judged, self.initial_policies, self.initial_closure
-            )
+            begun = self.initial_policies, self.initial_closure
+            summary = results.summarise(self.algorithm, self.unseen, flights, judged, *begun, refusals)
             summary |= {"engine_gap": gap, "recalled": recalled, "ended": self.ended}
             summary |= {} if real is None else {"real_unseen": real}
             metrics = self._written(summary, judged, judging)
@@ -296,7 +296,7 @@ class Run:
         self.episodes.append(record)
         dashboard.episode(record)
 
-    def _fly_the_real_system(self, bar: Progress) -> dict[str, Any] | None:
+    def _fly_the_real_system(self, bar: Progress, refusals: Mapping[Role, str]) -> dict[str, Any] | None:
         """The entry ``real_unseen`` of the summary; that of an earlier end, unless other flights are asked for.
 
         Before the first flight the run says how many of whom. Who has pressed Ctrl-C does not want the system to go on.
@@ -307,7 +307,7 @@ class Run:
         if not count or interrupted:
             return earlier
         laws: dict[str, nn.Module] = {live: self.algorithm.policies[live], **self.baselines}
-        if reason := results.grounded(self.config, self.algorithm, self.initial_policies):
+        if reason := results.grounded(self.config, self.algorithm, self.initial_policies, refusals):
             bar.write(f"the live policy does not fly the real system: {reason}")
             del laws[live]
         flown = {} if earlier is None else {name: law["episodes"] for name, law in earlier["controllers"].items()}

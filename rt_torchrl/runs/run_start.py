@@ -28,7 +28,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation import FIRST, Operation, Operator
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.systems.safety import OperatingLimits, SafetyLayer
-from rt_torchrl.trajectories.trajectory import SHORTEST, pieces_of_equal_length, until_end
+from rt_torchrl.trajectories.trajectory import SHORTEST, between_ends, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -108,7 +108,12 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> RecordedFlights:
     # A learner sums the rewards of several intervals.
     shortest = max(SHORTEST, config.twinning.learner.return_steps)
     segments = resample(log, physics, gap=options.gap, shortest=shortest).segments
-    flown = [until_end(physics, segment) for segment in segments if not physics.ended(segment.states[0])]
+    flown = [part for segment in segments for part in between_ends(physics, segment)]
+    if not flown:
+        raise ValueError(
+            f"log {str(path)!r}: every row has a state in which episodes of plant {physics.name!r} have ended; log the "
+            "operation, or correct units and `ended`."
+        )
     records = pieces_of_equal_length(flown, physics.n_steps, physics.dt)
     return RecordedFlights(physics, [record.mapped(lambda part: part.to(config.device)) for record in records])
 

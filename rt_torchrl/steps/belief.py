@@ -24,7 +24,7 @@ what noise of the sensors (:func:`~rt_torchrl.fit.sensors.noise_levels`) explain
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -158,7 +158,7 @@ class Belief:
         self.first: list[Flown] = []
         """The latest episodes of the controller that flew first."""
         self._state: dict[str, Any] | None = None
-        self._results: dict[str, Any] = {}
+        self._results: dict[Hashable, Any] = {}
         self._twins: dict[DigitalTwin, DigitalTwin] = {}
         self._copies: dict[Role, nn.Module] = {}
         virtual.twin.correct(partial(self.correction, latest=ANCHORS) if corrects else None)
@@ -199,7 +199,7 @@ class Belief:
         self.flown = [*self.flown, flown][-HISTORY:]
         self._state = None
 
-    def _kept(self, name: str, compute: Callable[[], Any]) -> Any:
+    def _kept(self, name: Hashable, compute: Callable[[], Any]) -> Any:
         """What is computed of the present twin and the episodes, once until one of both changes."""
         state = self.virtual.twin.state_dict() | {"noise": self.virtual.twin.noise}
         if self._state is None or not equal(state, self._state):
@@ -246,8 +246,8 @@ class Belief:
         episodes = theirs if others is None else [*theirs, others]
 
         def of_controller(episode: Scenario) -> float:
-            which = f"first {episode.initial_state.sum():.17g} {episode.exogenous.sum():.17g}"
-            cost: float = self._kept(which, lambda: self.virtual.cost(controller, episode))
+            values = tuple(part.cpu().numpy().tobytes() for part in episode)
+            cost: float = self._kept(values, lambda: self.virtual.cost(controller, episode))
             return cost
 
         def on_twin(cost_of: Callable[[Scenario], float], episodes: Sequence[Scenario]) -> float:

@@ -221,13 +221,12 @@ class Supervisor:
         Raises:
             ValueError: if nothing may act.
         """
-        refused, report = list[str](), dict[str, float | str]()
-        episodes = None if self.limits is None else self.episodes()
+        episodes, refused, report = self.checked(), list[str](), dict[str, float | str]()
         for role in sorted(self.policies, key=lambda role: role != live):  # the live one first
             policy = self.policies[role]
             reason, share = self.refusal(role, episodes)
             if not reason:
-                if self.limits is not None and episodes is not None:
+                if episodes is not None:
                     self._last = {"role": role, "weights": copy.deepcopy(policy.state_dict())}
                     report["predicted_violations"] = share
                 return policy, role, report
@@ -241,8 +240,12 @@ class Supervisor:
             return self.controller, FIRST, report
         raise ValueError(f"no policy may act. {report['reason']}. Widen the limits, or use --start controller.")
 
+    def checked(self) -> Scenario | None:
+        """Virtual episodes in which limits are checked; None without limits, and before anything is known."""
+        return None if self.limits is None else self.episodes()
+
     def episodes(self) -> Scenario | None:
-        """Virtual episodes, in which limits are checked, and policies beside the controller; always the same ones.
+        """Virtual episodes in which policies fly beside the controller, too; the same until others are drawn.
 
         None before anything is known.
         """
@@ -260,10 +263,10 @@ class Supervisor:
 
         Args:
             role: role of the policy.
-            episodes: see :meth:`episodes`; None without limits.
+            episodes: see :meth:`checked`.
         """
         policy = self.policies[role]
-        share = 0.0 if episodes is None or self.limits is None else self.predicted(policy, episodes)
+        share = 0.0 if episodes is None else self.predicted(policy, episodes)
         if share > 0.0:
             return f"{role} may not act: it would leave the limits in {100 * share:.3g} % of the intervals", share
         tried = bool(self.belief.flown)

@@ -146,6 +146,14 @@ def until_end(plant: Plant, flown: Trajectory) -> Trajectory:
     return flown.part(0, int(over.int().argmax()) + 1, plant.dt) if over.any() else flown
 
 
+def between_ends(plant: Plant, flown: Trajectory) -> list[Trajectory]:
+    """The parts of a log without batch dimensions, each from where the plant has not ended to its next early end."""
+    over = plant.ended(flown.states)
+    begins = ~over & torch.cat([torch.ones_like(over[:1]), over[:-1]])
+    parts = [flown.part(k, len(flown.actions), plant.dt) for k in begins.nonzero().flatten().tolist()]
+    return [until_end(plant, part) for part in parts if len(part.actions)]
+
+
 def whole_cost(plant: Plant, flight: Trajectory, n: int) -> Float[Tensor, " batch"]:
     """J_a of whole episodes of n intervals; with fewer they have ended, even if readings with noise do not show it."""
     flown = flight.actions.shape[-2]
